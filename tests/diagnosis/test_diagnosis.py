@@ -305,7 +305,7 @@ def test_commands_recorded_a_row_late_are_moved_up(effects):
     late = [np.concatenate((each.action[:1], each.action[:-1])) for each in whole.episodes]
     episodes = [dataclasses.replace(each, action=action) for each, action in zip(whole.episodes, late, strict=True)]
     prepared = prepare(dataclasses.replace(whole, episodes=tuple(episodes)), CartPole())
-    assert [warning for warning in prepared.warnings if "the commands were moved a row up" in warning]
+    assert [warning for warning in prepared.warnings if "recorded a row late" in warning]
     rows = len(late[0]) - 1  # the last command is not known
     assert torch.equal(prepared.rows.command[:, :rows], prepare(whole, CartPole()).rows.command[:, :rows])
 

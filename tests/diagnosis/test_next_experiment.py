@@ -44,7 +44,7 @@ def test_slight_causes_need_no_experiment():
     pairs: list[list[type[Effect]]] = [[ActuatorBias, ConstantForce], [CoulombFriction, QuadraticDrag]]
     groups = [[Alternative(effect, nothing, effect) for effect in pair] for pair in pairs]
     found = [Cause(effect.name, {}, 0.5, 0.5, slight=pair is pairs[1]) for pair in pairs for effect in pair]
-    advice = next_step(search, nothing, AMBIGUOUS, groups, found, nothing, (), (), ())
+    advice = next_step(search, nothing, AMBIGUOUS, groups, found, nothing, (), (), (), False)
     assert advice.startswith("To tell actuator_bias and constant_force apart: ")
     assert "friction" not in advice
 

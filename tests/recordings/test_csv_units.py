@@ -7,7 +7,7 @@ from tests.diagnosis.test_diagnosis_flights import record as a_flight
 from tests.own_systems import Winch
 from tests.recorded import a_run, a_table, load, refuses, write
 from visadapt.recordings import Episode, RecordingError, load_recording, write_recording
-from visadapt.systems import Quadrotor
+from visadapt.systems import FixedWing, Quadrotor
 
 RIGHT_AND_DOWN = np.array([1, -1, -1, 1, -1, -1, 1, 1, -1, -1, 1, -1, -1])
 """Signs of a vehicle's states in axes north, east and down."""
@@ -187,6 +187,24 @@ class TestUnits:
         load_recording(written(episode.state), Quadrotor())
         with pytest.raises(RecordingError, match=said):
             load_recording(written(change(episode.state)), Quadrotor())
+
+    @pytest.mark.parametrize(
+        ("system", "opposite"),
+        [(Quadrotor, ("rate_x",)), (Quadrotor, ("rate_y", "rate_z")), (FixedWing, ("elevator",)), (FixedWing, ())],
+    )
+    @pytest.mark.parametrize("down", [False, True])
+    def test_commands_that_turn_a_vehicle_the_other_way(self, file, system, opposite, down):
+        (episode,) = (recorded := a_flight(system(), rows=60, episodes=1)).episodes
+        names = (*recorded.measured, *(action.name for action in system.actions))
+        states = episode.state * (RIGHT_AND_DOWN if down else 1)
+        action = episode.action * [-1 if action.name in opposite else 1 for action in system.actions]
+        path = write(file, dict(zip(("time", *names), (episode.time, *states.T, *action.T), strict=True)))
+        if not opposite and not down:
+            load_recording(path, system())
+            return
+        with pytest.raises(RecordingError, match="with the other sign" if down else "had the other sign") as refused:
+            load_recording(path, system())
+        assert [action.name for action in system.actions if action.name in str(refused.value)] == [*opposite]
 
     def test_noise_is_no_reason_to_refuse(self, file):
         load(write(file, a_table(rows=400, noise=9e-3)))

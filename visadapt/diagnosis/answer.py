@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from visadapt.diagnosis.exploration import Explored, explore
 from visadapt.diagnosis.measured_gap import MeasuredGap, measure
 from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, UNEXPLAINED, Cause, Push, without_slight
 from visadapt.diagnosis.search.causes import causes
 from visadapt.diagnosis.search.fitted_models import ScoredModel
+from visadapt.diagnosis.search.passing_loads import passing_loads
 from visadapt.diagnosis.search.pushed_rows import share_pushed
 from visadapt.diagnosis.search.pushes import pushes
 from visadapt.diagnosis.search.repeated_causes import errors_with_repeats
 from visadapt.diagnosis.search.unexplained import SmoothFunction
+from visadapt.diagnosis.search.unexplained_load import has_joints
 from visadapt.diagnosis.verdict import left_by_source, verdict_of
 from visadapt.effects import Effect
 from visadapt.estimation.episode_phases import has_episode_phases, in_episode
@@ -39,6 +41,11 @@ class Answer:
     pushes: tuple[Push, ...]  # beyond the causes; beyond the source where there are none
     set_aside: tuple[Push, ...] = ()  # pushes whose rows were left out
 
+    @property
+    def no_gap_beside_pushes(self) -> bool:
+        """Whether there is no gap in the rows that are not within pushes."""
+        return bool(self.set_aside) and not self.causes
+
 
 def answer(
     recording: Recording,
@@ -53,6 +60,7 @@ def answer(
 
     A push acts in one episode alone, as no effect does: while it is among the rows, the most probable set is one that
     imitates it. So where a recording is unexplained, the rows within pushes are left out, and the others are explained.
+    If these have no gap, the recording stays unexplained, with what passes in `pushes`.
 
     Args:
         world: the source.
@@ -61,24 +69,28 @@ def answer(
         jobs, progress, announce: as `diagnose` takes them.
     """
 
-    def beside(aside: tuple[Push, ...]) -> Answer:
+    def beside(aside: tuple[Push, ...]) -> Explored:
         told = None if aside else announce
-        explored = explore(recording, world.system, effects, repeating, aside, jobs, progress, told)
-        return _answer(explored, world, aside, jobs, progress)
+        return explore(recording, world.system, effects, repeating, aside, jobs, progress, told)
 
-    first = latest = beside(())
+    explored = beside(())
+    pushes = _Pushes(world, explored)
+    first = latest = _answer(explored, pushes, (), jobs, progress)
     for _ in range(ROUNDS):
         if latest.verdict != UNEXPLAINED:
             break
-        found = _hiding(latest, world)
+        found = _hiding(latest, pushes)
         aside = (*latest.set_aside, *found)
         if not found or share_pushed(aside, recording, world.system) > MOST_PUSHED:
             break
-        latest = beside(aside)
-    return latest if latest.verdict != UNEXPLAINED and latest.pushes else first
+        latest = _answer(beside(aside), pushes, aside, jobs, progress)
+    if latest.verdict == UNEXPLAINED or not latest.pushes:
+        return first
+    # Beside what passes there is no gap, but what passes may be no push: an effect that acts in a few rows alone.
+    return replace(latest, verdict=UNEXPLAINED) if latest.no_gap_beside_pushes else latest
 
 
-def _answer(explored: Explored, world: World, aside: tuple[Push, ...], jobs: int, progress: Report | None) -> Answer:
+def _answer(explored: Explored, pushes: _Pushes, aside: tuple[Push, ...], jobs: int, progress: Report | None) -> Answer:
     search, comparison, groups = explored.search, explored.comparison, explored.groups
     repeats = [cause for cause, _ in explored.repeats]
     with_repeats = errors_with_repeats(explored.prepared, search) if repeats else None
@@ -91,12 +103,12 @@ def _answer(explored: Explored, world: World, aside: tuple[Push, ...], jobs: int
     partial = tuple(without_slight(explaining)) if closes else ()
     source_leaves = [] if found else left_by_source(search)
     # Where the causes explain the recording, the pushes are those beyond them.
-    pushed = _beyond(explored, comparison.best, world, comparison.functions) if found else ()
-    pushed = pushed if found else _beyond(explored, search.source, world, source_leaves)
+    beyond = (comparison.best, comparison.functions) if found else (search.source, source_leaves)
+    pushed = pushes.beyond(explored, *beyond)
     return Answer(explored, measured, verdict, found, partial, source_leaves, pushed, aside)
 
 
-def _hiding(unexplained: Answer, world: World) -> tuple[Push, ...]:
+def _hiding(unexplained: Answer, pushes: _Pushes) -> tuple[Push, ...]:
     """Pushes that may hide what else acts: beyond the source or, if there are none, beyond the best set, of which an
     effect may imitate them, without each of its effects, or with all of them. None that are set aside already."""
     explored = unexplained.explored
@@ -105,8 +117,8 @@ def _hiding(unexplained: Answer, world: World) -> tuple[Push, ...]:
     def each() -> Iterator[tuple[Push, ...]]:
         yield unexplained.pushes
         for effect in sorted(best.effects, key=lambda one: not _is_in_time(one)):
-            yield _beyond(explored, search.without(best, effect), world)
-        yield _beyond(explored, best, world)
+            yield pushes.beyond(explored, search.without(best, effect))
+        yield pushes.beyond(explored, best)
 
     for found in each():
         further = tuple(one for one in found if not any(one.overlaps(other) for other in unexplained.set_aside))
@@ -121,20 +133,29 @@ def _is_in_time(effect: type[Effect]) -> bool:
     return region is not None and region[0].unit == "s"
 
 
-def _beyond(
-    explored: Explored, found: ScoredModel, world: World, functions: Sequence[SmoothFunction] = ()
-) -> tuple[Push, ...]:
-    """The pushes beyond the source with the effects of a set, with their phases in each episode; it leaves these
-    functions unexplained."""
-    whole = explored.prepared.whole
-    if whole is None:
-        return ()
-    by_effect = found.by_effect(found.fits.theta[0])
+@dataclass(frozen=True)
+class _Pushes:
+    """The pushes in a recording."""
 
-    def explained(episode: int) -> World:
+    world: World  # the source
+    explored: Explored  # all rows
+
+    def beyond(
+        self, explored: Explored, found: ScoredModel, functions: Sequence[SmoothFunction] = ()
+    ) -> tuple[Push, ...]:
+        """Those beyond the source with the effects of a set that was `explored`, perhaps without the rows of some of
+        them, and that leaves these functions unexplained."""
+        whole = self.explored.prepared.whole
+        if not has_joints(self.world.system):
+            return passing_loads(self.explored.search, found, explored.search.rows)
+        if whole is None:
+            return ()
+        if not any(has_episode_phases(effect) for effect in found.effects):
+            return pushes(whole, self._with(found, 0), functions)
+        return pushes(whole, [self._with(found, episode) for episode in range(len(whole.episodes))], functions)
+
+    def _with(self, found: ScoredModel, episode: int) -> World:
+        """The source with the effects of a set, with their phases in an episode."""
+        by_effect = found.by_effect(found.fits.theta[0])
         effects = [in_episode(effect, values.tolist(), episode) for effect, values in by_effect.items()]
-        return world.with_effects(effects).double()
-
-    if not any(has_episode_phases(effect) for effect in found.effects):
-        return pushes(whole, explained(0), functions)
-    return pushes(whole, [explained(episode) for episode in range(len(whole.episodes))], functions)
+        return self.world.with_effects(effects).double()

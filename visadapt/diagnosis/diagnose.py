@@ -39,7 +39,7 @@ from visadapt.diagnosis.verdict import (
     next_step,
     shown_by_episodes,
 )
-from visadapt.diagnosis.words import listed, printable
+from visadapt.diagnosis.words import A_ROW_LATE, BESIDE_PUSHES, listed, printable
 from visadapt.effects import EFFECTS, Dropout, Effect, FrameDrop, Stage
 from visadapt.effects.catalogue import catalogue as all_effects, sized
 from visadapt.estimation.effect_fit import remembers
@@ -54,12 +54,6 @@ TOO_SHORT = "too short to hold a part of it out: the gap is that of the rows to 
 
 MAX_UNCHANGED = 0.1
 """Probability of the source above which a reader of the causes is told of it."""
-
-BESIDE_PUSHES = (
-    "the rows within pushes were left out, since pushes hide what else acts: the gap and its causes are those of the "
-    "other rows"
-)
-"""Where pushes were set aside."""
 
 NOT_SEARCHED = "what it reads depends on earlier rows, so it is not among the effects that are searched"
 
@@ -123,7 +117,7 @@ def diagnose(
     search, comparison, groups = explored.search, explored.comparison, explored.groups
     before, after = disturbances(search, comparison)
     gap, stages = measured.gap, stage_shares(search, comparison, groups, _found_before(explored, film))
-    if verdict == NO_GAP:  # The best set may hold an effect, which is none of the causes
+    if verdict == NO_GAP or answered.no_gap_beside_pushes:  # The best set's effects are none of the causes
         gap, stages = gap.without_causes(), dict.fromkeys(stages, 0.0)
     regions = _regions(found, before if found else after, explored.effects, profile_of(system).region_variables, seed)
     found_in_motion = Diagnosis(
@@ -154,6 +148,7 @@ def diagnose(
             explored.prepared.coarse,
             answered.source_leaves,
             {push.load for push in answered.pushes},
+            answered.no_gap_beside_pushes,
         ),
         warnings=(
             *used.warnings,
@@ -212,11 +207,19 @@ def _found_before(explored: Explored, film: Film | None) -> list[tuple[Stage, fl
 def _warnings(answered: Answer, origin: str) -> Iterator[str]:
     """What a reader of the diagnosis must know of the recording from `origin`, the comparison and the causes found."""
     explored, measured, verdict, found = answered.explored, answered.measured, answered.verdict, answered.causes
-    comparison, whole = explored.comparison, explored.prepared.whole
+    comparison = explored.comparison
     yield from explored.prepared.warnings
     if answered.set_aside:
         yield BESIDE_PUSHES
-    if verdict == UNEXPLAINED and whole is not None and (unread := unread_states(whole, explored.search.system)):
+    period, delays = explored.prepared.rows.period, [one for one in found if "delay" in one.parameters]
+    if delays and any(A_ROW_LATE in warning for warning in explored.prepared.warnings):
+        late = period - delays[0].parameters["delay"].value
+        yield (
+            f"a delay beside commands that were recorded a row, {period:.3g} s, late looks the same as no delay, and "
+            f"commands that were recorded {late:.2g} s late"
+        )
+    whole, system = explored.prepared.whole, explored.search.system
+    if verdict == UNEXPLAINED and whole is not None and (unread := unread_states(whole, system)):
         yield f"pushes in single episodes were not looked for: they need {listed(unread)}, which no sensor read"
     if not measured.errors.held_out:
         yield f"{origin}: {TOO_SHORT}"

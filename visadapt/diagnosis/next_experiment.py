@@ -65,7 +65,8 @@ def separate(classes: Sequence[Collection[type[Effect]]], system: System) -> str
                     settled |= {name, other}
         if len(names) > 1:
             every = settled == set(names)
-            advice = experiments if every else [*experiments, _general(members, profile_of(system))]
+            general = f"{_general(members, profile_of(system))}, or the experiment that --plan designs"
+            advice = experiments if every else [*experiments, general]
             parts.append(f"To tell {listed(names)} apart: " + "; ".join(advice) + ".")
     return " ".join(parts)
 
@@ -111,7 +112,7 @@ def untouched(pushed: Collection[str]) -> str:
     """The experiment that shows whether what pushes these loads is a hand."""
     return (
         f"Pushes on {listed([plain(load) for load in sorted(pushed)])} were found: record runs in which nothing "
-        "touches the machine, to see whether they return without a hand."
+        "touches the machine, no gust either, to see whether they return."
     )
 
 

@@ -82,6 +82,7 @@ def next_step(
     coarse: Sequence[CoarseSteps],
     source_leaves: Sequence[SmoothFunction],
     pushed: Collection[str],
+    no_gap_beside_pushes: bool,
 ) -> str:
     """The experiment to make next, in words; slight causes among those `found` need none.
 
@@ -90,7 +91,7 @@ def next_step(
     """
     if is_slow(comparison, verdict):
         return next_experiment.LONGER
-    if verdict in (NO_GAP, IDENTIFIED) and pushed:
+    if pushed and (verdict in (NO_GAP, IDENTIFIED) or no_gap_beside_pushes):
         return next_experiment.untouched(pushed)
     if verdict == NO_GAP and comparison.unexplained(False):
         return next_experiment.explain(comparison.functions, pushed)

@@ -9,6 +9,15 @@ from visadapt.diagnosis.result import Estimate
 
 UNKNOWN = "unknown"
 
+BESIDE_PUSHES = (
+    "the rows within pushes were left out, since pushes hide what else acts: the gap and its causes are those of the "
+    "other rows"
+)
+"""The warning of a diagnosis for which pushes were set aside."""
+
+A_ROW_LATE = "the commands were moved a row up"
+"""What it warns of where each command was recorded a row late."""
+
 OPPOSITE = " has the opposite sign of the source's"
 """What a diagnosis warns of, after the quantity's name, where it inverted a sign of the recording."""
 

@@ -10,6 +10,7 @@ from itertools import pairwise
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from visadapt.estimation.colour import Colour
 from visadapt.estimation.profiles import profile_of
@@ -235,6 +236,41 @@ def cut(
     episode = torch.tensor([index for index, _, _ in pieces])
     resolution = tuple(smallest_step(torch.cat([values[:, k] for values in measured])) for k in range(len(channels)))
     return Segments(out, used, inside, time, command, held, first, episode, channels, period, resolution)
+
+
+def joined(rows: Segments, state: Tensor) -> tuple[Segments, Tensor]:
+    """Windows of which each goes on where the one before ends, joined; with states (W, T, n) in them, joined alike."""
+    lengths = rows.inside.sum(1).long()
+    goes_on = (rows.episode[1:] == rows.episode[:-1]) & (rows.first[1:] == rows.first[:-1] + lengths[:-1])
+    begins = torch.cat((goes_on.new_ones(1), ~goes_on))
+    number = begins.cumsum(0) - 1  # of the joined window that each is part of
+    first = rows.first[begins]
+    window, row = rows.inside.nonzero().T
+    column = rows.first[window] - first[number[window]] + row
+    columns = torch.arange(int(column.max()) + 1)
+
+    def together(values: Tensor) -> Tensor:
+        out = values.new_zeros(len(first), len(columns), *values.shape[2:])
+        out[number[window], column] = values[window, row]
+        return out
+
+    inside, time = together(rows.inside), together(rows.time)
+    lasts = inside.sum(1).long() - 1
+    beyond = (columns - lasts[:, None]).clamp(min=0)  # rows beyond the window's end, where its last state goes on
+    last = columns - beyond
+    whole = replace(
+        rows,
+        measured=together(rows.measured),
+        used=together(rows.used),
+        inside=inside,
+        time=time.gather(1, last) + rows.period * beyond,
+        command=pad(rows.command, (0, 0, 0, len(columns))),
+        held=pad(rows.held, (0, len(columns)), value=rows.period),
+        first=first,
+        episode=rows.episode[begins],
+        estimated=None if rows.estimated is None else together(rows.estimated),
+    )
+    return whole, together(state)[torch.arange(len(first))[:, None], last]
 
 
 def stretches_without(bad: Sequence[Tensor], stretches: Sequence[Stretch]) -> list[Stretch]:

@@ -33,6 +33,9 @@ another zero or sign explains these; and how many times as large the error of th
 EXPLAINED_CORRELATION = 0.5
 """Correlation of measured and predicted accelerations above which the source explains them."""
 
+TURNS = ("omega_x", "omega_y", "omega_z")
+"""Rates of turn of a vehicle, which are no variable's rate, and whose changes are judged as accelerations are."""
+
 Columns = Mapping[str, NDArray[np.float64]]
 
 
@@ -202,7 +205,7 @@ def agreements(
     changed: Callable[[Columns], Columns] = _unchanged,
     delay: float = 0.0,
 ) -> dict[str, Agreement]:
-    """For each variable with a rate: how its acceleration follows the source's.
+    """For each variable with a rate, and each rate of turn: how its acceleration follows the source's.
 
     `changed` gives the measured states the units and names to be tried; `delay` is by how many s the commands
     act late.
@@ -250,6 +253,9 @@ def _accelerations(
         if rate in columns:
             measured.append((columns[rate][2 * stride :] - columns[rate][: -2 * stride]) / span)
         found[name] = np.stack(measured), predicted[:, names.index(rate)]
+    for name in sorted({*TURNS} & {*columns}):
+        measured = [(columns[name][2 * stride :] - columns[name][: -2 * stride]) / span]
+        found[name] = np.stack(measured), predicted[:, names.index(name)]
     return found
 
 

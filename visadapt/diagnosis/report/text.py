@@ -22,6 +22,7 @@ from visadapt.diagnosis.result import (
     without_slight,
 )
 from visadapt.diagnosis.words import (
+    BESIDE_PUSHES,
     MISFIT,
     chance,
     closed,
@@ -71,9 +72,8 @@ def sentence(diagnosis: Diagnosis) -> str:
     """The verdict in one plain sentence, with physical units."""
     gap = diagnosis.gap
     if diagnosis.verdict == NO_GAP:
-        beside = " beside the pushes" if diagnosis.where.pushes else ""
         return (
-            f"No gap{beside}: the simulator predicts this recording as well as its noise allows "
+            f"No gap: the simulator predicts this recording as well as its noise allows "
             f"(error {number(gap.before)}, noise {number(gap.floor)})."
         )
     return _explained(diagnosis) if diagnosis.causes else _unexplained(diagnosis)
@@ -155,6 +155,11 @@ def _unexplained(diagnosis: Diagnosis) -> str:
         return (
             "The frames show what neither the renderer nor a known effect of the camera explains: "
             f"{number(pixels.error, 2)} grey levels{most}; its own errors are {number(pixels.usual, 2)}."
+        )
+    if BESIDE_PUSHES in diagnosis.warnings:
+        return (
+            "Something passes that no known effect explains: a push, a gust, or an effect that acts now and then. "
+            f"Beside it there is no gap (error {number(gap.before)}, noise {number(gap.floor)})."
         )
     if math.isnan(gap.closed):
         return (

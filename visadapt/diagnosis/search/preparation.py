@@ -14,7 +14,7 @@ from visadapt.diagnosis.result import Push
 from visadapt.diagnosis.search import angle_defect, sensor_checks, sign_conventions
 from visadapt.diagnosis.search.pushed_rows import pushed_rows
 from visadapt.diagnosis.search.search import Search
-from visadapt.diagnosis.words import DERIVED, OPPOSITE
+from visadapt.diagnosis.words import A_ROW_LATE, DERIVED, OPPOSITE
 from visadapt.effects import Effect
 from visadapt.estimation.likelihood import FitState
 from visadapt.estimation.profiles import Convention, profile_of
@@ -53,8 +53,7 @@ EVEN_LOG_ODDS = 5.0
 """Log likelihood that evenly spaced stamps must gain over those recorded: at rest, both fit alike."""
 
 EARLIER_LOG_ODDS = 20.0
-"""Log likelihood that the source must gain by commands a row earlier than recorded, as no machine answers before it is
-asked."""
+"""Log likelihood that commands a row earlier than recorded must gain: no machine answers before it is asked."""
 
 MOST_FILLED = 2
 """Rows in a row whose readings are filled in by cubics: the acceleration in more of them would be made up."""
@@ -88,7 +87,7 @@ def prepare(
         catalogue: the effects that may act.
         pushes: the rows within them are in no window.
     """
-    draft, first = _with_commands_that_act(_on_its_clock(_read(recording, system, pushes)))
+    draft, first = _with_commands_that_act(_on_its_clock(_read(recording, system, pushes)), catalogue)
     if not profile_of(system).check_sensors:
         return draft.prepared()
     draft = _without_derived_velocities(_without_defective_angles(draft, first))
@@ -237,20 +236,22 @@ def _on_its_clock(draft: _Draft) -> _Draft:
     return replace(chosen, source=fit if len(kept) == len(channels) else None)
 
 
-def _with_commands_that_act(draft: _Draft) -> tuple[_Draft, FitState]:
-    """With the commands one row earlier, where the recording has each beside the readings that follow it; and the
+def _with_commands_that_act(draft: _Draft, catalogue: Sequence[type[Effect]]) -> tuple[_Draft, FitState]:
+    """With the commands one row earlier, where the recording has each beside the readings that it led to; and the
     source's fit."""
     readings = draft.readings
     fitted = draft.source or draft.source_fit()
     earlier = replace(readings, commands=[torch.cat((each[1:], each[-1:])) for each in readings.commands]).draft()
-    other = earlier.source_fit()
-    if other.likelihood[0] <= fitted.likelihood[0] + EARLIER_LOG_ODDS:
-        return replace(draft, source=fitted), fitted
-    told = (
-        "each command is recorded a row late, or nearly, beside the readings that it led to: the commands were moved a "
-        "row up, and a delay of less than a row may come of it"
+    as_given, other = (
+        Search(readings.system, one.rows.select(one.searched), catalogue, known)
+        for one, known in ((draft, fitted), (earlier, None))
     )
-    return replace(earlier, source=other, warnings=(*draft.warnings, told)), other
+    source = other.source.fits
+    # Commands that are late by less than a row are, a row earlier, those of a machine with a delay.
+    if not sign_conventions.stays_ahead(other, as_given, EARLIER_LOG_ODDS, other.fit_delays):
+        return replace(draft, source=fitted), fitted
+    told = f"each command is recorded a row late, beside the readings that it led to: {A_ROW_LATE}"
+    return replace(earlier, source=source, warnings=(*draft.warnings, told)), source
 
 
 def _without_defective_angles(draft: _Draft, source: FitState) -> _Draft:

@@ -1,14 +1,15 @@
-"""Whether a recording has other signs than the source: of the angle, the command or the position."""
+"""Whether a recording is to be read in another way: with another sign of the angle or the command, say."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
+from visadapt.diagnosis.search.fitted_models import ScoredModel
 from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.words import listed
 from visadapt.effects import Effect
@@ -27,11 +28,11 @@ MIN_GAIN_PER_READING = 0.1
 
 ALIKE = 10.0  # Log likelihood of the source within which two conventions are as likely
 
-EFFECTS_WITH_SIGNS, MOST_EFFECTS_WITH_SIGNS, LEADS_WITH_SIGNS = 2, 6, 3
-"""Before a sign convention is decided on, EFFECTS_WITH_SIGNS effects are added one by one to the source in both, the
-source's convention and the best other one, since a large effect can look like a wrong sign. While the other one is
-ahead, but not clearly, further effects are added, up to MOST_EFFECTS_WITH_SIGNS. LEADS_WITH_SIGNS effects are tried for
-each one added."""
+EFFECTS_ADDED, MOST_EFFECTS_ADDED, LEADS = 2, 6, 3
+"""Before it is decided in which way a recording is read, EFFECTS_ADDED effects are added one by one to the source in
+both, as it is given and in the best other way, since a large effect can look like a wrong sign. While the other way is
+ahead, but not clearly, further effects are added, up to MOST_EFFECTS_ADDED. LEADS effects are tried for each one
+added."""
 
 
 def opposite_signs(
@@ -54,20 +55,32 @@ def opposite_signs(
     others = [Search(system, each, catalogue, rival=_likelihood(as_given)) for each in conventions]
     most = max(_likelihood(each) for each in others)
     alike = [k for k, each in enumerate(others) if _likelihood(each) >= most - ALIKE]
-    other = others[alike[0]]
-    if _ahead(other, as_given) <= required:
+    if not stays_ahead(others[alike[0]], as_given, required):
         return None
+    return replace(every[alike[0]], name=listed([every[k].name for k in alike], "or"))
+
+
+def stays_ahead(
+    other: Search, as_given: Search, required: float, beside: Callable[[], Sequence[ScoredModel]] = tuple
+) -> bool:
+    """Whether a recording read in another way is likelier than as it is given, by the log likelihood that is required:
+    under the source and, if it is, when effects are added to the source in both, and to sets `beside` it in the
+    other."""
+    if _ahead(other, as_given) <= required:
+        return False
+    if not other.catalogue:
+        return True
     # A sensor that is late by a period can look like a wrong sign, and the screening does not see it.
     for search in (as_given, other):
         search.try_late_sensors()
-    for added in range(MOST_EFFECTS_WITH_SIGNS):
-        if added >= EFFECTS_WITH_SIGNS and not 0 < _ahead(other, as_given) <= required:
+    bases = beside()
+    for added in range(MOST_EFFECTS_ADDED):
+        if added >= EFFECTS_ADDED and not 0 < _ahead(other, as_given) <= required:
             break
         for search in (as_given, other):
-            search.extend([search.best], LEADS_WITH_SIGNS)
-    if _ahead(other, as_given) <= required:
-        return None
-    return replace(every[alike[0]], name=listed([every[k].name for k in alike], "or"))
+            search.extend([search.best], LEADS)
+        bases = [max(other.extend([base], LEADS), key=lambda each: each.log_odds, default=base) for base in bases]
+    return _ahead(other, as_given) > required
 
 
 def _ahead(one: Search, other: Search) -> float:

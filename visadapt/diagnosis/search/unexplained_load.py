@@ -89,7 +89,7 @@ def load_tracks(recording: Recording, worlds: Sequence[World], known: SmoothFunc
         known: a load that acts as a function of states, beyond those of the worlds.
     """
     system = worlds[0].system
-    if not _has_joints(system) or unread_states(recording, system):
+    if not has_joints(system) or unread_states(recording, system):
         return []
     measured = [system.index(name) for name in recording.measured]
     found = [
@@ -122,7 +122,7 @@ def load_tracks(recording: Recording, worlds: Sequence[World], known: SmoothFunc
 
 def unread_states(recording: Recording, system: System) -> list[str]:
     """What the unexplained load needs and no sensor read: positions of joints, and states that belong to no joint."""
-    if not _has_joints(system):
+    if not has_joints(system):
         return []
     joints = zip(system.coordinates, system.loads, strict=True)
     positions = [
@@ -133,6 +133,11 @@ def unread_states(recording: Recording, system: System) -> list[str]:
     return [name for name in needed if name not in recording.measured]
 
 
+def has_joints(system: System) -> bool:
+    """Whether each load acts on a joint, as on no aircraft's body."""
+    return len(system.coordinates) == len(system.loads)
+
+
 def _usual_size(load: Tensor) -> Tensor:
     """(J,) root mean square of loads (N, J), of which larger ones count as MOST_POWER says."""
     power = load.square()
@@ -140,11 +145,6 @@ def _usual_size(load: Tensor) -> Tensor:
     for _ in range(SIZE_ROUNDS):
         usual = torch.minimum(power, MOST_POWER * usual).mean(0)
     return usual.sqrt()
-
-
-def _has_joints(system: System) -> bool:
-    """Whether each load acts on a joint, as on no aircraft's body."""
-    return len(system.coordinates) == len(system.loads)
 
 
 def _measured(episode: Episode, usable: NDArray[np.bool_] | None) -> Iterator[Episode]:
