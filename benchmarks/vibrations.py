@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -27,6 +26,7 @@ import visadapt as va
 from experiments.parallel import Jobs, in_processes
 from experiments.result_tables import Row, write_rows
 from visadapt import effects
+from visadapt.diagnosis import exploration
 from visadapt.effects.catalogue import catalogue as every_effect
 from visadapt.storage.run_folder import once, open_run
 from visadapt.weights import shipped
@@ -90,8 +90,7 @@ def _judged(settings: Settings, name: str, method: str, seed: int) -> dict[str, 
     folder = settings.work / f"{name} {method}".replace(" ", "-").replace("/", "-") / str(seed)
     open_run(folder, {"hidden": name, "seed": seed, "noise": NOISE, "rows": EPISODES * ROWS})
     if method == WHITE:
-        diagnosing = import_module("visadapt.diagnosis.diagnose")  # an attribute of that name is the function
-        with patch.object(diagnosing, "with_coloured_noise", lambda search, comparison, *_: (search, comparison)):
+        with patch.object(exploration, "with_coloured_noise", lambda search, comparison, *_: (search, comparison)):
             return once(folder / "outcome.json", lambda: _outcome(HIDDEN[name](), seed))
     return once(folder / "outcome.json", lambda: _outcome(HIDDEN[name](), seed))
 

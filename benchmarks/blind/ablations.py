@@ -17,7 +17,7 @@ from visadapt.diagnosis.search.search import TWO_FOR_ONE_UP_TO, Exchanges, Searc
 from visadapt.estimation.fit_states import QUICK, Effects
 from visadapt.estimation.likelihood import FitState
 
-DIAGNOSE = import_module("visadapt.diagnosis.diagnose")
+EXPLORATION = import_module("visadapt.diagnosis.exploration")
 """The module; as an attribute of its package, the name is that of the function."""
 
 
@@ -109,9 +109,9 @@ PARTS = {
     "starts without process noise": Part(Search, "_fit_from_quiet", _fit_with_noise),
     "late sensors": Part(Search, "_fit_late", _nothing, lambda _, self, bases: bool(bases)),
     "phases of episodes": Part(Search, "_phases_of_episodes", _nothing),
-    "jumps": Part(DIAGNOSE, "with_jumps", _nothing, lambda out, _: out is not None),
+    "jumps": Part(EXPLORATION, "with_jumps", _nothing, lambda out, _: out is not None),
     "coloured noise": Part(
-        DIAGNOSE,
+        EXPLORATION,
         "with_coloured_noise",
         lambda found, compared, *_: (found, compared),
         lambda out, found, *_: out[0] is not found,

@@ -7,10 +7,11 @@ import torch
 import visadapt as va
 from tests.own_systems import Pendulum
 from visadapt.diagnosis import planning
+from visadapt.diagnosis.result import SCHEMA_VERSION
 from visadapt.effects import EFFECTS
 from visadapt.recordings import read_recording
 from visadapt.setups.explained import explained
-from visadapt.storage.run_folder import read_json
+from visadapt.storage.run_folder import read_json, write_json
 from visadapt.targets import TargetError, synthetic
 
 NOISE = torch.tensor([0.005, 0.02, 0.009, 0.05])
@@ -39,10 +40,16 @@ class Knee(Pendulum):
     name, loads = "knee_of_a_test", (va.Variable("knee", "N m", -1.0, 1.0),)
 
 
-def test_what_a_file_names_on_a_system_of_ones_own_is_known_before_it_is_read():
+def test_what_a_file_names_on_a_system_of_ones_own_is_known_before_it_is_read(tmp_path):
     assert "knee.viscous_friction" not in EFFECTS
-    explained(va.World(Knee()))
-    assert "knee.viscous_friction" in EFFECTS
+    values = {"coefficient": {"value": 0.1, "unit": "N m s/rad", "ci90": [0.09, 0.11]}}
+    cause = {"effect": "knee.viscous_friction", "parameters": values, "indistinguishable_from": []}
+    found = {"schema": SCHEMA_VERSION, "system": Knee.name, "verdict": "identified", "causes": [cause]}
+    write_json(tmp_path / "found.json", found)
+    (effect,) = va.load_effects(tmp_path / "found.json", Knee())
+    assert effect.get_parameter("coefficient").item() == pytest.approx(0.1)
+    with pytest.raises(ValueError, match=r"found.json: a diagnosis of a knee_of_a_test, where a cartpole is given"):
+        va.load_effects(tmp_path / "found.json", va.CartPole())
 
 
 def test_an_angle_of_the_opposite_sign_is_refused_since_the_policy_would_drive_the_wrong_way(tmp_path, only_effects):

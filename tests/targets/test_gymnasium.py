@@ -121,6 +121,16 @@ def returning(reset=None, step=None):
     return GymnasiumTarget(Other, MAP, name="toy")
 
 
+def test_a_reset_without_a_seed_is_told_what_is_right():
+    class Seedless(Toy):
+        def reset(self):  # type: ignore[override]
+            return super().reset()
+
+    says = r"reset\(\) failed: TypeError: .*'seed' \(def reset\(self, \*, seed=None, options=None\) is right\)$"
+    with pytest.raises(TargetError, match=says):
+        GymnasiumTarget(Seedless, MAP, name="toy").reset(1, generator())
+
+
 @pytest.mark.parametrize(
     ("wrong", "says"),
     [

@@ -11,7 +11,7 @@ from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, UNEXPLAINED, Cause,
 from visadapt.diagnosis.search.causes import causes
 from visadapt.diagnosis.search.fitted_models import ScoredModel
 from visadapt.diagnosis.search.passing_loads import passing_loads
-from visadapt.diagnosis.search.pushed_rows import share_pushed
+from visadapt.diagnosis.search.pushed_rows import share_left_out
 from visadapt.diagnosis.search.pushes import pushes
 from visadapt.diagnosis.search.repeated_causes import errors_with_repeats
 from visadapt.diagnosis.search.unexplained import SmoothFunction
@@ -23,7 +23,7 @@ from visadapt.progress import Report, staged
 from visadapt.recordings import Recording
 from visadapt.world import World
 
-MOST_PUSHED = 0.25  # Share of the rows within pushes above which these are not set aside
+MOST_LEFT_OUT = 0.25  # Share of the rows that may be left out because of pushes
 
 ROUNDS = 2  # in which pushes are set aside: the first ones may hide others
 
@@ -74,23 +74,25 @@ def answer(
         return explore(recording, world.system, effects, repeating, aside, jobs, progress, told)
 
     explored = beside(())
-    pushes = _Pushes(world, explored)
-    first = latest = _answer(explored, pushes, (), jobs, progress)
+    finder = _PushFinder(world, explored)
+    first = latest = _answer(explored, finder, (), jobs, progress)
     for _ in range(ROUNDS):
         if latest.verdict != UNEXPLAINED:
             break
-        found = _hiding(latest, pushes)
+        found = _hiding(latest, finder)
         aside = (*latest.set_aside, *found)
-        if not found or share_pushed(aside, recording, world.system) > MOST_PUSHED:
+        if not found or share_left_out(aside, recording, world.system) > MOST_LEFT_OUT:
             break
-        latest = _answer(beside(aside), pushes, aside, jobs, progress)
+        latest = _answer(beside(aside), finder, aside, jobs, progress)
     if latest.verdict == UNEXPLAINED or not latest.pushes:
         return first
     # Beside what passes there is no gap, but what passes may be no push: an effect that acts in a few rows alone.
     return replace(latest, verdict=UNEXPLAINED) if latest.no_gap_beside_pushes else latest
 
 
-def _answer(explored: Explored, pushes: _Pushes, aside: tuple[Push, ...], jobs: int, progress: Report | None) -> Answer:
+def _answer(
+    explored: Explored, finder: _PushFinder, aside: tuple[Push, ...], jobs: int, progress: Report | None
+) -> Answer:
     search, comparison, groups = explored.search, explored.comparison, explored.groups
     repeats = [cause for cause, _ in explored.repeats]
     with_repeats = errors_with_repeats(explored.prepared, search) if repeats else None
@@ -104,11 +106,12 @@ def _answer(explored: Explored, pushes: _Pushes, aside: tuple[Push, ...], jobs: 
     source_leaves = [] if found else left_by_source(search)
     # Where the causes explain the recording, the pushes are those beyond them.
     beyond = (comparison.best, comparison.functions) if found else (search.source, source_leaves)
-    pushed = pushes.beyond(explored, *beyond)
-    return Answer(explored, measured, verdict, found, partial, source_leaves, pushed, aside)
+    return Answer(
+        explored, measured, verdict, found, partial, source_leaves, finder.pushes_beyond(explored, *beyond), aside
+    )
 
 
-def _hiding(unexplained: Answer, pushes: _Pushes) -> tuple[Push, ...]:
+def _hiding(unexplained: Answer, finder: _PushFinder) -> tuple[Push, ...]:
     """Pushes that may hide what else acts: beyond the source or, if there are none, beyond the best set, of which an
     effect may imitate them, without each of its effects, or with all of them. None that are set aside already."""
     explored = unexplained.explored
@@ -117,8 +120,8 @@ def _hiding(unexplained: Answer, pushes: _Pushes) -> tuple[Push, ...]:
     def each() -> Iterator[tuple[Push, ...]]:
         yield unexplained.pushes
         for effect in sorted(best.effects, key=lambda one: not _is_in_time(one)):
-            yield pushes.beyond(explored, search.without(best, effect))
-        yield pushes.beyond(explored, best)
+            yield finder.pushes_beyond(explored, search.without(best, effect))
+        yield finder.pushes_beyond(explored, best)
 
     for found in each():
         further = tuple(one for one in found if not any(one.overlaps(other) for other in unexplained.set_aside))
@@ -134,13 +137,13 @@ def _is_in_time(effect: type[Effect]) -> bool:
 
 
 @dataclass(frozen=True)
-class _Pushes:
-    """The pushes in a recording."""
+class _PushFinder:
+    """Finds the pushes in a recording."""
 
     world: World  # the source
     explored: Explored  # all rows
 
-    def beyond(
+    def pushes_beyond(
         self, explored: Explored, found: ScoredModel, functions: Sequence[SmoothFunction] = ()
     ) -> tuple[Push, ...]:
         """Those beyond the source with the effects of a set that was `explored`, perhaps without the rows of some of

@@ -35,6 +35,7 @@ from visadapt.diagnosis.search.searched_effects import shown_by
 from visadapt.diagnosis.search.unexplained_load import unread_states
 from visadapt.diagnosis.verdict import (
     at_bounds,
+    late_by_less_than,
     left_unexplained,
     next_step,
     shown_by_episodes,
@@ -211,13 +212,8 @@ def _warnings(answered: Answer, origin: str) -> Iterator[str]:
     yield from explored.prepared.warnings
     if answered.set_aside:
         yield BESIDE_PUSHES
-    period, delays = explored.prepared.rows.period, [one for one in found if "delay" in one.parameters]
-    if delays and any(A_ROW_LATE in warning for warning in explored.prepared.warnings):
-        late = period - delays[0].parameters["delay"].value
-        yield (
-            f"a delay beside commands that were recorded a row, {period:.3g} s, late looks the same as no delay, and "
-            f"commands that were recorded {late:.2g} s late"
-        )
+    if any(A_ROW_LATE in warning for warning in explored.prepared.warnings):
+        yield from late_by_less_than(explored.prepared.rows.period, found)
     whole, system = explored.prepared.whole, explored.search.system
     if verdict == UNEXPLAINED and whole is not None and (unread := unread_states(whole, system)):
         yield f"pushes in single episodes were not looked for: they need {listed(unread)}, which no sensor read"

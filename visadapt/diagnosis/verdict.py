@@ -169,6 +169,16 @@ def at_bound(effect: str, parameter: str, end: float, unit: str) -> str:
     )
 
 
+def late_by_less_than(row: float, found: Sequence[Cause]) -> list[str]:
+    """A warning where a delay is among the causes `found` beside commands that were recorded a row, in s, late."""
+    delays = [cause.parameters["delay"].value for cause in found if "delay" in cause.parameters]
+    return [
+        f"a delay beside commands that were recorded a row, {row:.3g} s, late looks the same as no delay, and commands "
+        f"that were recorded {row - delay:.2g} s late"
+        for delay in delays[:1]
+    ]
+
+
 def left_unexplained(comparison: ModelComparison, verdict: str, unexplained: bool) -> list[str]:
     """A warning where causes are named although they leave something."""
     if verdict in (IDENTIFIED, AMBIGUOUS) and unexplained:

@@ -25,6 +25,8 @@ from visadapt.targets.env_map import EnvMap
 RETURNED = {"reset": ("observation", "info"), "step": ("observation", "reward", "terminated", "truncated", "info")}
 """What these methods of an environment return."""
 
+CALLED = {"reset": "reset(self, *, seed=None, options=None)", "step": "step(self, action)"}
+"""How they are defined."""
 
 STEP_TOLERANCE = 0.01  # Part of a step by which a period may differ from a whole number of them
 
@@ -198,9 +200,11 @@ class GymnasiumTarget(Target):
             returned = getattr(env, method)(*arguments, **named)
         except Exception as error:  # whatever the environment raises becomes one line
             last = traceback.extract_tb(error.__traceback__)[-1]
+            place = f"({last.filename}, line {last.lineno})"
+            if last.filename == __file__:  # it does not take what it is given
+                place = f"(def {CALLED[method]} is right)"
             raise TargetError(
-                f"{self.name}: {method}() failed: {type(error).__name__}: {_first_line(error)} "
-                f"({last.filename}, line {last.lineno})"
+                f"{self.name}: {method}() failed: {type(error).__name__}: {_first_line(error)} {place}"
             ) from error
         right = RETURNED[method]
         if not isinstance(returned, tuple) or len(returned) != len(right):

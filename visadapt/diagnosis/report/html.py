@@ -11,7 +11,7 @@ from visadapt.diagnosis.report import figures, film, text
 from visadapt.diagnosis.result import Diagnosis
 from visadapt.effects import EFFECTS
 from visadapt.storage.atomic_files import replacing
-from visadapt.systems.base import NAMED
+from visadapt.systems import system_named
 
 
 def write_report(path: str | os.PathLike[str], diagnosis: Diagnosis, settings: Mapping[str, str]) -> None:
@@ -51,7 +51,7 @@ def _gaps(diagnosis: Diagnosis) -> list[tuple[str, float, str]]:
 
 
 def _figures(diagnosis: Diagnosis) -> dict[str, Any]:
-    data, system = diagnosis.figures, NAMED[diagnosis.system]
+    data, system = diagnosis.figures, system_named(diagnosis.system)
     corrected = bool(diagnosis.causes)
     return {
         "predictions": [figures.prediction(one, diagnosis.recording, system, corrected) for one in data.predictions],

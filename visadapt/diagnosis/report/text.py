@@ -35,14 +35,15 @@ from visadapt.diagnosis.words import (
     with_unit,
 )
 from visadapt.effects import EFFECTS, CameraEffect
-from visadapt.systems.base import NAMED
+from visadapt.systems import system_named
 
 REPEATED = "the readings that are repeated"
 
 
 def unit_of(variable: str, system: str) -> str:
     """The unit of the variable of a region or a profile."""
-    known = {one.name: one.unit for one in (*NAMED[system].states, *NAMED[system].actions)}
+    kind = system_named(system)
+    known = {one.name: one.unit for one in (*kind.states, *kind.actions)}
     return {"time": "s", "episode": "1"}.get(variable) or known.get(variable, "1")
 
 
