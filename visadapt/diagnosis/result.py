@@ -48,7 +48,8 @@ class Region:
 
 @dataclass(frozen=True)
 class Push:
-    """A passing load on one joint that no function of state and command explains; several may act in a recording."""
+    """A passing load on one joint, or along or about one axis of a vehicle, that no function of state and command
+    explains; several may act in a recording."""
 
     episode: int
     load: str  # the load that it adds to
