@@ -18,6 +18,7 @@ from visadapt.recordings.clock import Note, RawEpisode, check_forward, check_ste
 from visadapt.recordings.columns import convert, match
 from visadapt.recordings.csv import read_rows
 from visadapt.recordings.episode import Episode, Recording, RecordingError
+from visadapt.recordings.ground import in_flight
 from visadapt.recordings.hdf5 import read_names, read_stretches
 from visadapt.recordings.logs import read_log
 from visadapt.recordings.physics import is_in_newtons, same_after_a_turn
@@ -94,7 +95,7 @@ def load_recording(
             check_forward(raw)
         check_steps(episodes, system)
         whole += [without_outliers(raw, system, note) for raw in episodes]
-    whole = _commands(_shared(whole, system, note), system, note)
+    whole = [in_flight(raw, system, note) for raw in _commands(_shared(whole, system, note), system, note)]
     check_commands(whole, system, note)
     if not frames:
         for _, of_file in groupby(whole, lambda raw: raw.path):
