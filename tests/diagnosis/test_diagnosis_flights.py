@@ -125,6 +125,30 @@ def test_flights_need_not_be_equally_long(system, effect, true):
     assert estimate.value == pytest.approx(true, abs=1.5 * (estimate.ci90[1] - estimate.ci90[0]))
 
 
+@pytest.mark.parametrize("speed", [0.2, 1.0])
+def test_a_vehicle_that_hardly_moves_does_not_show_its_drag(speed):
+    """The wind draws it away; in 4 s it comes to 0.7 of its speed."""
+    system, rows = Quadrotor(), 40
+    wind = Wind(velocity_x=speed, velocity_y=0.0, velocity_z=0.0, coefficient=0.3)
+    world, generator = World(system, [wind.double()], period=0.1, substeps=10), torch.Generator().manual_seed(0)
+    hover = torch.tensor([[system.hover(), 0, 0, 0]], dtype=torch.float64)
+    state = torch.zeros(1, 13, dtype=torch.float64)
+    state[:, 6] = 1
+    at, states = world.start(state), []
+    with torch.no_grad():
+        for _ in range(rows):
+            states.append(at.state[0] + 0.1 * NOISE * torch.randn(13, generator=generator, dtype=torch.float64))
+            at = world.step(at, hover)
+    seen = torch.stack(states).numpy()
+    episode = Episode(0.1 * np.arange(rows), hover.expand(rows, -1).numpy(), seen)
+    names = tuple(variable.name for variable in system.states)
+    found = diagnose(
+        Recording((episode,), names, 0.1, ("run",)), World(system, period=0.1), catalogue=[LinearDrag, Wind]
+    )
+    assert [cause.effect for cause in found.causes] == ["wind"]
+    assert any("the vehicle hardly moves" in warning for warning in found.warnings) == (speed == 0.2)
+
+
 def test_the_command_reads_a_quadrotor_s_csv(tmp_path, capsys, monkeypatch):
     # Not by its dotted name, which is that of the function.
     module = importlib.import_module("visadapt.diagnosis.diagnose")

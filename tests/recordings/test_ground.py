@@ -30,13 +30,13 @@ def standing(state, seed):
 def test_rows_on_the_ground_are_left_out(system, before, after, tmp_path):
     recorded = record(system(), rows=80, episodes=1)
     (flight,) = recorded.episodes
-    states, actions = [flight.state], [flight.action]
+    parts = [(flight.state, flight.action)]
     nothing = np.tile([-1.0, 0, 0, 0], (STANDING, 1))
     if before:
-        states, actions = [standing(flight.state[0], 1), *states], [nothing, *actions]
+        parts = [(standing(flight.state[0], 1), nothing), *parts]
     if after:
-        states, actions = [*states, standing(flight.state[-1], 2)], [*actions, nothing]
-    states, actions = np.concatenate(states), np.concatenate(actions)
+        parts = [*parts, (standing(flight.state[-1], 2), nothing)]
+    states, actions = (np.concatenate(each) for each in zip(*parts, strict=True))
     names = (*recorded.measured, *(action.name for action in system.actions))
     time = PERIODS[system.name] * np.arange(len(states))
     path = write(tmp_path / "run.csv", dict(zip(("time", *names), (time, *states.T, *actions.T), strict=True)))

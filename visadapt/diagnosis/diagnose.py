@@ -35,6 +35,7 @@ from visadapt.diagnosis.search.searched_effects import shown_by
 from visadapt.diagnosis.search.unexplained_load import unread_states
 from visadapt.diagnosis.verdict import (
     at_bounds,
+    hovers,
     late_by_less_than,
     left_unexplained,
     next_step,
@@ -224,6 +225,7 @@ def _warnings(answered: Answer, origin: str) -> Iterator[str]:
     yield from at_bounds(comparison, found, explored.effects)
     bare = comparison.unchanged
     yield from shown_by_episodes(comparison, verdict, unexplained)
+    yield from hovers(explored.search, comparison, found)
     if found:
         yield from phases_of_episodes(comparison.best)
         if bare > MAX_UNCHANGED and not explored.repeats:

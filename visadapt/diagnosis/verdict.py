@@ -14,7 +14,8 @@ from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.search.sensor_checks import CoarseSteps
 from visadapt.diagnosis.search.unexplained import SmoothFunction, smooth_functions
 from visadapt.diagnosis.words import listed, number, with_unit
-from visadapt.effects import Effect, Parameter
+from visadapt.effects import EFFECTS, Effect, Parameter, QuadraticDrag, RotorDrag
+from visadapt.effects.aerial import AirDrag
 from visadapt.estimation.candidate import CandidateModel
 
 MIN_GAP_CLOSED = 0.95
@@ -27,6 +28,10 @@ run."""
 CLEAR_OF_NOISE = 3.0
 """Ratio of prediction error to measurement noise above which there is a gap. Where the ratio with the causes is still
 above it, the share of the gap that they close decides the verdict."""
+
+HOVERING = 0.2  # m/s, root mean square of a vehicle's speed up to which it hardly moves
+
+AIR = (AirDrag, RotorDrag, QuadraticDrag)  # Effects that depend on the velocity against the air
 
 CLOSES_BUT = "the causes close the gap but do not explain everything"
 """What the warning of `left_unexplained` begins with."""
@@ -176,6 +181,22 @@ def late_by_less_than(row: float, found: Sequence[Cause]) -> list[str]:
         f"a delay beside commands that were recorded a row, {row:.3g} s, late looks the same as no delay, and commands "
         f"that were recorded {row - delay:.2g} s late"
         for delay in delays[:1]
+    ]
+
+
+def hovers(search: Search, comparison: ModelComparison, found: Sequence[Cause]) -> list[str]:
+    """A warning where drag or wind is found, and the vehicle hardly moves."""
+    named = [cause.effect for cause in without_slight(found) if issubclass(EFFECTS.get(cause.effect, Effect), AIR)]
+    if not named or not search.profile.is_aircraft:
+        return []
+    columns = [search.system.index(name) for name in ("x_dot", "y_dot", "z_dot")]
+    velocity = comparison.best.fits.state[0][search.rows.inside > 0][:, columns]
+    speed = float(velocity.square().sum(1).mean().sqrt())
+    if speed > HOVERING:
+        return []
+    return [
+        f"the vehicle hardly moves ({number(speed, 2)} m/s): what its controller makes of the wind may bias "
+        f"{listed(named)} beyond the intervals; flights to and fro at several speeds are right"
     ]
 
 
