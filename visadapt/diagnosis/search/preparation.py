@@ -87,12 +87,14 @@ def prepare(
         catalogue: the effects that may act.
         pushes: the rows within them are in no window.
     """
-    draft, first = _with_commands_that_act(_on_its_clock(_read(recording, system, pushes)), catalogue)
-    if not profile_of(system).check_sensors:
-        return draft.prepared()
-    draft = _without_derived_velocities(_without_defective_angles(draft, first))
-    # After the velocities, since those that lag make the wrong sign likelier.
-    return _in_signs_of_source(draft, first, catalogue).prepared()
+    draft = _on_its_clock(_read(recording, system, pushes))
+    if profile_of(system).check_sensors:
+        first = draft.source or draft.source_fit()
+        draft = _without_derived_velocities(_without_defective_angles(replace(draft, source=first), first))
+        # After the velocities, since those that lag make the wrong sign likelier.
+        draft = _in_signs_of_source(draft, first, catalogue)
+    # Last, since a wrong sign makes another instant likelier.
+    return _with_commands_that_act(draft, catalogue).prepared()
 
 
 @dataclass(frozen=True)
@@ -236,24 +238,6 @@ def _on_its_clock(draft: _Draft) -> _Draft:
     return replace(chosen, source=fit if len(kept) == len(channels) else None)
 
 
-def _with_commands_that_act(draft: _Draft, catalogue: Sequence[type[Effect]]) -> tuple[_Draft, FitState]:
-    """With the commands one row earlier, where the recording has each beside the readings that it led to; and the
-    source's fit."""
-    readings = draft.readings
-    fitted = draft.source or draft.source_fit()
-    earlier = replace(readings, commands=[torch.cat((each[1:], each[-1:])) for each in readings.commands]).draft()
-    as_given, other = (
-        Search(readings.system, one.rows.select(one.searched), catalogue, known)
-        for one, known in ((draft, fitted), (earlier, None))
-    )
-    source = other.source.fits
-    # Commands that are late by less than a row are, a row earlier, those of a machine with a delay.
-    if not sign_conventions.stays_ahead(other, as_given, EARLIER_LOG_ODDS, other.fit_delays):
-        return replace(draft, source=fitted), fitted
-    told = f"each command is recorded a row late, beside the readings that it led to: {A_ROW_LATE}"
-    return replace(earlier, source=source, warnings=(*draft.warnings, told)), source
-
-
 def _without_defective_angles(draft: _Draft, source: FitState) -> _Draft:
     """Without readings of the angle where its sensor is defective; `source` is the source's fit to the draft's rows."""
     readings = draft.readings
@@ -305,6 +289,29 @@ def _in_signs_of_source(draft: _Draft, first: FitState, catalogue: Sequence[type
     rows, raw = (sign_conventions.to_source(each, convention) for each in (draft.rows, draft.raw))
     rows, raw = _with_unmeasured(rows, raw, system)
     return replace(draft, convention=convention, defect=band).changed(rows, raw, told)
+
+
+def _with_commands_that_act(draft: _Draft, catalogue: Sequence[type[Effect]]) -> _Draft:
+    """With the commands one row earlier, where the recording has each beside the readings that it led to."""
+    system, readings = draft.readings.system, draft.readings
+    rows, raw = (replace(each, command=_a_row_earlier(each.command, 1)) for each in (draft.rows, draft.raw))
+    rows, raw = _with_unmeasured(rows, raw, system)
+    as_given, other = (
+        Search(system, one.select(draft.searched), catalogue, source)
+        for one, source in ((draft.rows, draft.source), (rows, None))
+    )
+    # Commands that are late by less than a row are, a row earlier, those of a machine with a delay.
+    if not sign_conventions.stays_ahead(other, as_given, EARLIER_LOG_ODDS, other.fit_delays):
+        return replace(draft, source=as_given.source.fits)
+    told = f"each command is recorded a row late, beside the readings that it led to: {A_ROW_LATE}"
+    moved = replace(readings, commands=[_a_row_earlier(each, 0) for each in readings.commands])
+    return replace(draft, readings=moved).changed(rows, raw, told)
+
+
+def _a_row_earlier(command: Tensor, dim: int) -> Tensor:
+    """Commands whose rows along a dimension are one earlier; the last stays."""
+    count = command.shape[dim]
+    return command.index_select(dim, torch.arange(1, count + 1).clamp(max=count - 1))
 
 
 def _evenly_spaced(stamps: Tensor) -> Tensor:
