@@ -10,6 +10,7 @@ import torch
 from tests.diagnosed import NOISE, record
 from visadapt import diagnose
 from visadapt.diagnosis.search.preparation import prepare
+from visadapt.diagnosis.words import A_ROW_LATE
 from visadapt.effects import (
     ActuatorBacklash,
     ActuatorBias,
@@ -305,7 +306,7 @@ def test_commands_recorded_a_row_late_are_moved_up(effects):
     late = [np.concatenate((each.action[:1], each.action[:-1])) for each in whole.episodes]
     episodes = [dataclasses.replace(each, action=action) for each, action in zip(whole.episodes, late, strict=True)]
     prepared = prepare(dataclasses.replace(whole, episodes=tuple(episodes)), CartPole())
-    assert [warning for warning in prepared.warnings if "recorded a row late" in warning]
+    assert [warning for warning in prepared.warnings if A_ROW_LATE in warning]
     rows = len(late[0]) - 1  # the last command is not known
     assert torch.equal(prepared.rows.command[:, :rows], prepare(whole, CartPole()).rows.command[:, :rows])
 
@@ -323,6 +324,7 @@ def test_a_quantity_of_opposite_sign_is_inverted_and_the_cause_keeps_its_own(nam
     turned = tuple(Episode(e.time, command * e.action, e.state * np.array(states)) for e in forced.episodes)
     result = diagnose(dataclasses.replace(forced, episodes=turned), SOURCE, catalogue=[ConstantForce, AngleOffset])
     assert any(f"the {name} has the opposite sign" in warning for warning in result.warnings)
+    assert not any(A_ROW_LATE in warning for warning in result.warnings)
     assert names(result) == {"constant_force"}
     assert result.causes[0].parameters["force"].value == pytest.approx(1.0, rel=0.05)
 
