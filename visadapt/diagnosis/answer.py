@@ -39,7 +39,7 @@ class Answer:
     partial: tuple[Cause, ...]  # those that close a part of a gap that is unexplained
     source_leaves: list[SmoothFunction]  # where there are no causes
     pushes: tuple[Push, ...]  # beyond the causes; beyond the source where there are none
-    set_aside: tuple[Push, ...] = ()  # pushes whose rows were left out
+    set_aside: tuple[Push, ...]  # pushes whose rows were left out
 
     @property
     def no_gap_beside_pushes(self) -> bool:
@@ -52,9 +52,9 @@ def answer(
     world: World,
     effects: Sequence[type[Effect]],
     repeating: type[Effect],
-    jobs: int = 1,
-    progress: Report | None = None,
-    announce: Callable[[str], object] | None = None,
+    jobs: int,
+    progress: Report | None,
+    announce: Callable[[str], object] | None,
 ) -> Answer:
     """What explains a recording, if need be beside pushes.
 

@@ -39,10 +39,10 @@ def explore(
     system: System,
     effects: Sequence[type[Effect]],
     repeating: type[Effect],
-    pushes: Sequence[Push] = (),
-    jobs: int = 1,
-    progress: Report | None = None,
-    announce: Callable[[str], object] | None = None,
+    pushes: Sequence[Push],
+    jobs: int,
+    progress: Report | None,
+    announce: Callable[[str], object] | None,
 ) -> Explored:
     """Search for the sets of `effects` that explain a recording of states, and compare the best of them.
 

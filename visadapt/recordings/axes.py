@@ -10,7 +10,7 @@ import numpy as np
 
 from visadapt.recordings.clock import RawEpisode
 from visadapt.recordings.episode import RecordingError
-from visadapt.recordings.physics import TURNS, Columns, agreements, can_decide
+from visadapt.recordings.physics import EXPLAINED_ERROR, TURNS, Columns, agreements, can_decide
 from visadapt.systems import RigidBody, System
 
 TO_RIGHT = ("y", "y_dot", "q_y", "q_z", "omega_y", "omega_z")
@@ -25,9 +25,9 @@ TURNED = {
 QUARTER = {"x": "y", "x_dot": "y_dot", "y": "x", "y_dot": "x_dot"}
 """Positions in axes east and north beside an attitude whose axes are north and west: x is -y there, and y is x."""
 
-EXPLAINED_ERROR, OTHER_ERROR_RATIO = 0.75, 2.0
-"""Mean over the axes of the error of predicted accelerations (`Agreement.error`) below which other axes, or signs,
-explain them; and how many times as large it must be in those of the recording."""
+OTHER_ERROR_RATIO = 2.0
+"""How many times as large as in other axes, or with other signs, the error of predicted accelerations must be in those
+of the recording, where the others explain them."""
 
 
 def check_axes(episodes: Sequence[RawEpisode], system: System) -> None:

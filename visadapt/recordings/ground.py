@@ -42,9 +42,9 @@ def _falls(raw: RawEpisode, system: RigidBody) -> NDArray[np.bool_]:
     state[:, system.index("q_w")] = 1
     for name, values in raw.states.items():
         if name.startswith("q_"):
-            state[:, system.index(name)] = torch.from_numpy(np.ascontiguousarray(values))
+            state[:, system.index(name)] = torch.from_numpy(values)
     load = torch.zeros(len(state), len(system.loads), dtype=torch.float64)
-    change = system.derivative(state, torch.from_numpy(np.ascontiguousarray(raw.action)), load)
+    change = system.derivative(state, torch.from_numpy(raw.action), load)
     acceleration: NDArray[np.float64] = change[:, system.index("z_dot")].numpy()
     falls: NDArray[np.bool_] = ~(acceleration > -FALLS * float(system.gravity))  # NaN of a wing without airspeed
     return falls

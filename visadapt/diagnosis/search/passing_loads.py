@@ -26,8 +26,8 @@ from visadapt.systems import Variable
 WIDTH = 0.6  # Prediction times over which loads are averaged
 
 MIN_RATIO = 12.0
-"""Mean load over its median size from which something passes. In six flights of a quadrotor by another simulator the
-largest was 7.3 where nothing did."""
+"""Mean load over its median size from which something passes. In three flights of a quadrotor by another simulator, the
+largest on which nothing did was 7.3."""
 
 NORMAL = 1.4826  # Standard deviation of what is normally distributed over its median size
 
@@ -41,7 +41,7 @@ class _Track:
     """One load in one episode, at N instants a period apart, but for gaps."""
 
     episode: int
-    time: NDArray[np.float64]  # (N,) s since the episode began, half-way through a period
+    time: NDArray[np.float64]  # (N,) s since the episode began, from which the load acts for a period
     load: NDArray[np.float64]  # (N,)
     mean: NDArray[np.float64]  # (N,) over WIDTH about each instant
 
@@ -86,9 +86,10 @@ def _passing(tracks: list[_Track], port: Variable, period: float, count: int) ->
     tries = sum(len(track.mean) for track in tracks)
     for track in tracks:
         size = np.abs(track.mean) / usual
-        for start, end in runs(size > EDGE * size.max()):
+        large = size > EDGE * size.max()
+        for start, end in runs(large):
             peak = start + int(size[start:end].argmax())
-            if size[peak] < MIN_RATIO or size[peak] <= EDGE * size.max():
+            if not large[start] or size[peak] < MIN_RATIO:
                 continue
             around = slice(max(0, start - count // 2), end + count // 2)
             impulse = period * float(track.load[around].sum())
