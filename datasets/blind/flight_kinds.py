@@ -43,6 +43,9 @@ NEUTRAL: dict[str, float] = {
             "ground_effect.radius",
             "ground_effect.ground",
             "dropout.rate",
+            *(f"attitude_offset.{angle}" for angle in ("roll", "pitch", "yaw")),
+            *(f"rate_offset.{axis}" for axis in "xyz"),
+            "positioning_delay.delay",
         ),
         0.0,
     ),
@@ -78,6 +81,11 @@ def _directed(names: tuple[str, ...]) -> Draw:
 def _slowing(names: tuple[str, ...]) -> Draw:
     """Draws a direction with positive components."""
     return lambda rng, _: {name: abs(value) for name, value in _directed(names)(rng, 0.0).items()}
+
+
+def _whole_steps(size: float, _: Shape) -> Shape:
+    """A delay that is a multiple of the integration step."""
+    return {"delay": 0.005 * max(1, round(size / 0.005))}
 
 
 def _along(size: float, shape: Shape) -> Shape:
@@ -132,8 +140,7 @@ SURFACES = ("elevator", "aileron", "rudder")
 NAMED: tuple[tuple[Kind, tuple[str, ...]], ...] = (
     (Kind("actuator_gain", "actuation", 0.01, 0.6, scale, sign), BOTH),
     (Kind("actuator_bias", "actuation", 0.001, 0.2, signed("offset"), sign), BOTH),
-    # A multiple of the integration step.
-    (Kind("actuator_delay", "actuation", 0.005, 0.15, lambda s, _: {"delay": 0.005 * max(1, round(s / 0.005))}), BOTH),
+    (Kind("actuator_delay", "actuation", 0.005, 0.15, _whole_steps), BOTH),
     (Kind("actuator_lag", "actuation", 0.005, 0.2, plain("time_constant")), BOTH),
     (Kind("actuator_deadzone", "actuation", 0.003, 0.2, plain("width")), BOTH),
     (Kind("actuator_saturation", "actuation", 0.3, 2.5, lambda s, _: {"limit": float(np.exp(-s))}), BOTH),
@@ -188,6 +195,11 @@ REST: tuple[tuple[Kind, tuple[str, ...]], ...] = (
         QUADROTOR,
     ),
     (Kind("dropout", "sensing", 0.003, 0.5, plain("rate")), BOTH),
+    (Kind("attitude_offset", "sensing", 0.001, 0.25, _along, _directed(("roll", "pitch", "yaw"))), BOTH),
+    (Kind("rate_offset", "sensing", 0.0005, 0.25, _along, _directed(("x", "y", "z"))), BOTH),
+    (Kind("positioning_delay", "sensing", 0.01, 0.15, _whole_steps), QUADROTOR),
+    # A wing flies nearly straight: a short delay shows as little but an offset of its position.
+    (Kind("positioning_delay", "sensing", 0.03, 0.15, _whole_steps), WING),
 )
 """The rest of the catalogue."""
 

@@ -7,7 +7,7 @@ any recording is written. A diagnoser must never open the key. None of the libra
 
 Effects are scaled to a drawn strength: the root mean square, over rows and over the 13 readings, of the change that an
 effect makes to the source's prediction half a second ahead from the true states, in units of the measurement noise; for
-a dropout, of the change in the readings.
+a fault of sensors, of the change in the readings.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ import tyro
 from datasets.blind.flight_control import CONTROLLERS, PERIODS, Chain, Flyers, starts
 from datasets.blind.flight_kinds import FOREIGN, NEUTRAL, named
 from datasets.blind.flight_plants import PLANTS, RESTING, Array, Motion, step
+from datasets.blind.flight_sensing import sensed, with_losses
 from datasets.blind.kinds import Effects, Kind, Shape, evenly_mixed
 from datasets.blind.sealing import as_csv, key_path, names, seal
 
@@ -102,6 +103,8 @@ class Flights:
     """ROWS"""
     states: Array
     """(ROWS, N, 13)"""
+    sensed: Array
+    """(ROWS, N, 13) readings without noise"""
     commands: Array
     """(ROWS, N, 4)"""
 
@@ -133,7 +136,7 @@ def make(settings: Settings) -> list[Draft]:
     for k, draft in enumerate(drafts):
         own_columns = slice(k * EPISODES, (k + 1) * EPISODES)
         noise = draft.rng.normal(size=(ROWS, EPISODES, 13)) * NOISE
-        draft.readings = _read(draft, flown.states[:, own_columns] + noise)
+        draft.readings = _received(draft, flown.sensed[:, own_columns] + noise)
         draft.commands = flown.commands[:, own_columns]
     return drafts
 
@@ -156,9 +159,10 @@ def _measure(drafts: list[Draft], system: System, fly: Flyers) -> None:
     gaps = _gaps(flown, system).reshape(len(drafts), EPISODES)
     for k, (draft, own) in enumerate(zip(drafts, gaps, strict=True)):
         draft.strength = float(np.sqrt(np.mean(own)))
-        if draft.loss_draws is not None:
-            states = flown.states[:, k * EPISODES : (k + 1) * EPISODES]
-            draft.strength = float(np.sqrt(np.mean(((_read(draft, states) - states) / NOISE) ** 2)))
+        if draft.kind is not None and draft.kind.stage == "sensing":
+            own_columns = slice(k * EPISODES, (k + 1) * EPISODES)
+            change = _received(draft, flown.sensed[:, own_columns]) - flown.states[:, own_columns]
+            draft.strength = float(np.sqrt(np.mean((change / NOISE) ** 2)))
 
 
 def _flown(drafts: list[Draft], system: System, fly: Flyers, h: float) -> Flights:
@@ -172,6 +176,7 @@ def _flown(drafts: list[Draft], system: System, fly: Flyers, h: float) -> Flight
     motions: list[Motion] = []
     states: list[Array] = []
     commands: list[Array] = []
+    path: list[Array] = []
     for row in range(ROWS):
         motions.append(at)
         states.append(as_states(at, states[-1][:, 6:10] if states else None))
@@ -180,18 +185,15 @@ def _flown(drafts: list[Draft], system: System, fly: Flyers, h: float) -> Flight
         chain.push(command)
         for k in range(substeps):
             time = row * period + k * h
+            path.append(np.concatenate([at.place, at.velocity], 1))
             at = step(PLANTS[system], parameters, time, at, chain(time, h), h)
-    return Flights(motions, np.stack(states), np.stack(commands))
+    true = np.stack(states)
+    return Flights(motions, true, sensed(parameters, true, np.stack(path), h), np.stack(commands))
 
 
-def _read(draft: Draft, rows: Array) -> Array:
-    """Readings (ROWS, EPISODES, 13) of rows: one that a dropout loses repeats the one before."""
-    if draft.loss_draws is None:
-        return rows
-    out, lost = rows.copy(), draft.loss_draws < _value(draft, "dropout.rate", 0.0)
-    for row in range(1, ROWS):
-        out[row] = np.where(lost[row][:, None], out[row - 1], rows[row])
-    return out
+def _received(draft: Draft, rows: Array) -> Array:
+    """Readings (ROWS, EPISODES, 13), of which a dropout may lose some."""
+    return rows if draft.loss_draws is None else with_losses(rows, draft.loss_draws < _value(draft, "dropout.rate", 0))
 
 
 def _value(draft: Draft, name: str, neutral: float) -> float:

@@ -12,6 +12,7 @@ from benchmarks.blind.scoring import sizes
 from datasets.blind import flights
 from datasets.blind.flight_kinds import NAMED, NEUTRAL, REST, named
 from datasets.blind.flight_plants import PLANTS, RESTING, Motion, quadrotor, step
+from datasets.blind.flight_sensing import sensed
 from datasets.blind.flights import ACTIONS, NOISE, STATES, Settings, as_states, lines, main, make
 from visadapt.effects import EFFECTS, DynamicsEffect
 from visadapt.effects.catalogue import catalogue
@@ -84,6 +85,36 @@ def test_every_effect_of_the_catalogue_is_drawn_once(system):
     assert sorted(kind.name for kind in named("core", system) + named("rest", system)) == effects
 
 
+@pytest.mark.parametrize("kind", ["attitude_offset", "rate_offset", "positioning_delay"])
+def test_sensors_read_as_the_catalogue_s(kind):
+    """Readings of three rows, of which the vehicle's positions are known at their halves too, by both codes."""
+    period, generator = 0.1, torch.Generator().manual_seed(0)
+    state = 0.3 * torch.randn(2, 13, generator=generator, dtype=torch.float64)
+    state[:, 6] += 1.0
+    world = World(SYSTEMS["quadrotor"](), (), period / 2)
+    command = torch.zeros(2, 4, dtype=torch.float64)
+    parameters = {
+        "attitude_offset": {"roll": 0.1, "pitch": -0.2, "yaw": 0.3},
+        "rate_offset": {"x": 0.1, "y": -0.2, "z": 0.3},
+        "positioning_delay": {"delay": period / 2},
+    }[kind]
+    reads = World(SYSTEMS["quadrotor"](), [EFFECTS[kind](**parameters).double()], period, substeps=2)
+    with torch.no_grad():
+        halves = [world.start(state)]
+        for _ in range(5):
+            halves.append(world.step(halves[-1], command))
+        at, expected = reads.start(state), []
+        for _ in range(3):
+            seen, at = reads.measure(at)
+            expected.append(seen.numpy())
+            at = reads.step(at, command)
+    path = np.stack([half.state.numpy() for half in halves])
+    p = {name: np.full(2, parameters.get(name.removeprefix(f"{kind}."), neutral)) for name, neutral in NEUTRAL.items()}
+    found = sensed(p, path[::2], path[..., :6], period / 2)
+    # The library interpolates between rows.
+    np.testing.assert_allclose(found, expected, atol=1e-3 if kind == "positioning_delay" else 1e-7)
+
+
 def test_lagging_motors_are_the_catalogue_s():
     """Two seconds of a quadrotor under steps of the command, by both codes."""
     constant, period, substeps = 0.06, 0.1, 20
@@ -108,7 +139,7 @@ def test_lagging_motors_are_the_catalogue_s():
 
 
 def test_a_dropout_repeats_rows_at_its_rate():
-    drafts = make(Settings(Path("unused"), "fixed_wing", 1, seed=2, effects="rest"))
+    drafts = make(Settings(Path("unused"), "fixed_wing", 6, seed=2, effects="rest"))
     dropped = [draft for draft in drafts if draft.kind is not None and draft.kind.name == "dropout"]
     assert dropped
     for draft in dropped:

@@ -20,4 +20,5 @@ from visadapt.effects.parameters import *
 from visadapt.effects.residual import *
 from visadapt.effects.sensing import *
 from visadapt.effects.vehicle import *
+from visadapt.effects.vehicle_sensors import *
 from visadapt.effects.wing import *
