@@ -37,7 +37,10 @@ COARSEST, COARSE, FINE = 0, 1, 2
 quick fits, and for reported results."""
 
 SHORT_PERIOD = 0.005
-"""s: up to it the midpoint rule is accurate enough for what is not reported, and takes half as long."""
+"""s: up to it the midpoint rule is accurate enough for what is not reported, and takes half as long, unless the system
+is stiff."""
+
+MIDPOINT_SHARE = 0.1  # Longest period with the midpoint rule, over the longest step of Runge-Kutta
 
 STABLE = 2.0
 """Ratio, to the longest step that is accurate, of one in which Runge-Kutta is stable."""
@@ -74,11 +77,12 @@ class CandidateModel:
             smooth_step = min([self.profile.longest_step, *(stable_step(*own, effect) for effect in effects)])  # type: ignore[arg-type]  # hashable, as types
         if accuracy == FINE:
             smooth_step = min(smooth_step, self.profile.fine_step)
-        step = smooth_step
+        step = smooth_step = min(smooth_step, rows.longest_step)
         if any(effect.abrupt for effect in effects):
             step = min(smooth_step, self.profile.longest_abrupt_steps[accuracy])
         longest = float(rows.held.max())
-        integrator = "midpoint" if accuracy < FINE and rows.period <= SHORT_PERIOD else "rk4"
+        short = rows.period <= min(SHORT_PERIOD, MIDPOINT_SHARE * longest_step(system))
+        integrator = "midpoint" if accuracy < FINE and short else "rk4"
         placeholders = [effect(**{parameter.name: 0.0 for parameter in effect.table}) for effect in effects]
         self._world, self._smooth_world = (
             World(system, placeholders, rows.period, integrator, steps_within(longest, each))

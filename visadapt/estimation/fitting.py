@@ -35,6 +35,7 @@ STEPS_TO_COME = 4
 the iterations left, STEPS_TO_COME at most) is more than OUT_OF_REACH below its rival's."""
 
 MAX_LOG_VARIANCE_CHANGE = 1.5  # Largest change of a log variance in one iteration
+FALLING = 0.9  # Share of it by which a noise falls, from which on how far it will fall is unknown
 
 
 def fit(
@@ -63,6 +64,7 @@ def fit(
     damping = torch.full((len(models),), FIRST_DAMPING, dtype=torch.float64)
     stalled = torch.zeros(len(models), dtype=torch.long)
     gained = torch.full_like(damping, math.inf)  # by the last step that gained something
+    falling = torch.zeros(len(models), dtype=torch.bool)  # whether a noise falls as fast as it may: more is to come
     active = torch.arange(len(models))
     here = best = start
     at: Derivatives | None = None
@@ -84,12 +86,13 @@ def fit(
             at = at.replaced(active[better], now[better])
             gained[active] = torch.where(better, gain, gained[active])
             to_come = min(STEPS_TO_COME, iterations - 1 - iteration)
-            in_reach = best.likelihood + to_come * gained > rival - OUT_OF_REACH
+            in_reach = falling | (best.likelihood + to_come * gained > rival - OUT_OF_REACH)
             # Fits that have converged leave the batch.
             active = active[(stalled[active] < 2) & (damping[active] < MAX_DAMPING) & in_reach[active]]
             if not len(active):
                 break
         here = _step(best, at, damping, bounds, models[0])
+        falling = (best.log_noise - here.log_noise).amax(1) > FALLING * MAX_LOG_VARIANCE_CHANGE / (1 + damping)
         if not process_noise:
             here = replace(here, log_process=start.log_process)
     return best

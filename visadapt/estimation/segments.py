@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -44,6 +45,7 @@ class Segments:
     colour: Colour | None = None  # of a fit's innovations, where they are known not to be white
     jumps: bool = False  # whether process noise is a jump of each velocity; False: a load on each joint
     estimated: Tensor | None = None  # (W, T, n) states, of which the `unmeasured` are used; None: these are 0
+    longest_step: float = math.inf  # s, in which Runge-Kutta follows the motion of the rows
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -16,6 +16,7 @@ from visadapt.diagnosis.search.pushed_rows import pushed_rows
 from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.words import A_ROW_LATE, DERIVED, OPPOSITE
 from visadapt.effects import Effect
+from visadapt.estimation.integration_step import with_longest_step
 from visadapt.estimation.likelihood import FitState
 from visadapt.estimation.profiles import Convention, profile_of
 from visadapt.estimation.repeated_readings import RepeatedReadings, find_repeats
@@ -128,7 +129,9 @@ class _Readings:
         )
         if resolution := self.recording.resolution:
             rows, raw = (replace(each, resolution=resolution) for each in (rows, raw))
-        return _Draft(self, *_with_unmeasured(rows, raw, self.system))
+        rows, raw = _with_unmeasured(rows, raw, self.system)
+        rows = with_longest_step(rows, self.system)
+        return _Draft(self, rows, replace(raw, longest_step=rows.longest_step))
 
     @property
     def first_usable(self) -> list[int]:
