@@ -12,10 +12,10 @@ from torch import Tensor
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.likelihood import (
     MAX_LOG_PROCESS,
-    MIN_LOG_PROCESS,
     Derivatives,
     FitState,
     differentiate,
+    min_log_process,
     noise_members,
 )
 
@@ -58,7 +58,7 @@ def fit(
         noise = colour.log_process.expand_as(start.log_process), colour.log_noise.expand_as(start.log_noise)
         start = replace(start, log_process=noise[0], log_noise=noise[1])
     elif not process_noise:
-        start = replace(start, log_process=torch.full_like(start.log_process, MIN_LOG_PROCESS))
+        start = replace(start, log_process=torch.full_like(start.log_process, min_log_process(models[0].rows.period)))
     bounds = _bounds(models, start)
     all_windows = torch.ones(start.state.shape[:2], dtype=torch.float64)
     damping = torch.full((len(models),), FIRST_DAMPING, dtype=torch.float64)
@@ -158,7 +158,7 @@ def _step(
         fits,
         theta=theta,
         state=fits.state + (at.smoothed * weights[:, None, None, None]).sum(-1),
-        log_process=(fits.log_process + log_change[:, :groups]).clamp(MIN_LOG_PROCESS, MAX_LOG_PROCESS),
+        log_process=(fits.log_process + log_change[:, :groups]).clamp(min_log_process(model.rows.period), MAX_LOG_PROCESS),
         log_noise=torch.maximum(fits.log_noise + noise_change, lowest_noise),
     )
 

@@ -37,9 +37,18 @@ from visadapt.estimation.segments import initial_states
 LEAST_PROCESS_NOISE = 1e-6
 """Standard deviation of a process noise of every state, in its unit, beside that of the loads: practically none."""
 
-MIN_LOG_PROCESS = math.log(1e-4**2)
+LEAST_DRIVE, LEAST_DRIVE_PERIOD = 1e-4, 0.02
+"""Least standard deviation of the process noise of the driven velocities over a period, m/s and rad/s, and the period,
+in s, below which it is less in proportion: as a load it is then the same on every clock."""
+
 MAX_LOG_PROCESS = math.log(3.0**2)
-"""Bounds of the log process noise variance of the driven velocities, (m/s)^2 and (rad/s)^2."""
+"""Upper bound of the log process noise variance of the driven velocities, (m/s)^2 and (rad/s)^2."""
+
+
+def min_log_process(period: float) -> float:
+    """Lower bound of the same on a clock with this period in s."""
+    return 2 * math.log(LEAST_DRIVE * min(1.0, period / LEAST_DRIVE_PERIOD))
+
 
 MIN_READING_PER_STATE = 0.01
 """Derivative of a reading by its own state at or below which the reading counts as telling nothing of that state, as

@@ -18,7 +18,7 @@ from torch import Tensor
 from visadapt.diagnosis.search.unexplained import loads_of, variables_of
 from visadapt.estimation.candidate import COARSE, CandidateModel, with_loads
 from visadapt.estimation.kalman import forward, respond
-from visadapt.estimation.likelihood import MIN_LOG_PROCESS, FitState, linear_problem, variances
+from visadapt.estimation.likelihood import FitState, linear_problem, min_log_process, variances
 from visadapt.world import World
 
 POINTS = 50  # Rows of the recording at which the kernel's functions are centred
@@ -85,7 +85,8 @@ def fit_black_box(model: CandidateModel, fits: FitState) -> BlackBox:
     best = nominal = first.validated(regression, logs), fits, logs, regression
     for decade in range(1, 1 + MAX_DECADES):
         # What the black box explains is no longer process noise.
-        tried = replace(fits, log_process=(fits.log_process - decade * math.log(10)).clamp(min=MIN_LOG_PROCESS))
+        lowered = (fits.log_process - decade * math.log(10)).clamp(min=min_log_process(model.rows.period))
+        tried = replace(fits, log_process=lowered)
         regression = _Regression.of(model, tried, gains, values, here)
         logs = regression.optimised(logs, REFINING_ITERATIONS)
         gain = first.validated(regression, logs)
