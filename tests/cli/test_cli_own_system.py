@@ -102,6 +102,16 @@ def test_a_parameter_that_the_derivative_does_not_use_is_named(rig, capsys):
     assert line in capsys.readouterr().out.splitlines()
 
 
+def test_a_command_that_the_derivative_does_not_use_is_named(rig, capsys):
+    spare = '(Variable("voltage", "V", -5.0, 5.0), Variable("brake", "V", 0.0, 5.0))'
+    text = page_code()[0]
+    assert (one := '(Variable("voltage", "V", -5.0, 5.0),)') in text
+    (rig / "furuta.py").write_text(text.replace(one, spare))
+    assert cli.main(["check", "furuta.py:Furuta"]) == 0
+    line = "brake    changes no rate within the ranges: derivative does not use this command"
+    assert line in capsys.readouterr().out.splitlines()
+
+
 def test_a_class_that_lacks_something_is_refused_by_every_command(rig, capsys):
     text = page_code()[0].replace('"arm", "rad"', '"arm", ""').replace('"voltage", "V"', '"voltage", " "')
     (rig / "furuta.py").write_text(text)

@@ -7,7 +7,7 @@ import sys
 
 from visadapt.cli.errors import InputError
 from visadapt.effects.catalogue import catalogue
-from visadapt.systems.contract import complaints, unused_parameters
+from visadapt.systems.contract import complaints, unused_commands, unused_parameters
 
 
 def run(options: argparse.Namespace) -> None:
@@ -22,6 +22,7 @@ def run(options: argparse.Namespace) -> None:
         shown = (f"{one.name} {one.unit} ({one.low:g} to {one.high:g})" for one in getattr(system, kind))
         print(f"{kind:8} {', '.join(shown)}")
     print(f"{'time':8} predictions reach {system.prediction_time:g} s ahead (prediction_time)")
-    for name in unused_parameters(system()):
-        print(f"{name:8} changes no rate within the ranges: derivative does not use this parameter")
+    for kind, names in (("command", unused_commands(system())), ("parameter", unused_parameters(system()))):
+        for name in names:
+            print(f"{name:8} changes no rate within the ranges: derivative does not use this {kind}")
     print(f"{system.name} is right; {len(catalogue(system()))} effects act on it (visadapt effects --system ...)")

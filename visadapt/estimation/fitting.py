@@ -158,7 +158,9 @@ def _step(
         fits,
         theta=theta,
         state=fits.state + (at.smoothed * weights[:, None, None, None]).sum(-1),
-        log_process=(fits.log_process + log_change[:, :groups]).clamp(min_log_process(model.rows.period), MAX_LOG_PROCESS),
+        log_process=(fits.log_process + log_change[:, :groups]).clamp(
+            min_log_process(model.rows.period), MAX_LOG_PROCESS
+        ),
         log_noise=torch.maximum(fits.log_noise + noise_change, lowest_noise),
     )
 

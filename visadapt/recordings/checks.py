@@ -5,6 +5,7 @@ These are heuristics that raise only where the numbers cannot be right; a record
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from itertools import combinations, product
 
@@ -33,6 +34,10 @@ MOST_RATE_RANGES = 3.0
 """Rates above this multiple of the system's stated range are taken to be in another unit."""
 SMALL_COMMAND = 0.01
 """Share of its range within which a command that stays there is asked about."""
+DEGREES = 180 / math.pi
+"""In a radian."""
+SURE_OF_DEGREES = 0.023
+"""Half of the distance, in the logarithm, from the degrees in a radian to the seconds in a minute."""
 IS_RATE_CORRELATION, NOT_RATE_CORRELATION = 0.8, 0.3
 """Correlation of a column with the change of another above which it is its rate, and below which it is not."""
 
@@ -172,6 +177,16 @@ def _check_clock(raw: RawEpisode, system: System) -> None:
         if rate is not None and rate.any():
             change = _rates(raw.time, values, system.states[system.index(name)].unit == "rad")
             ratios[name] = float(np.abs(change).mean() / np.abs(rate).mean())
+    angles = all(system.states[system.index(name)].unit == "rad" for name in ratios)
+    if (
+        angles
+        and len(ratios) > 1
+        and all(abs(math.log(ratio / DEGREES)) < SURE_OF_DEGREES for ratio in ratios.values())
+    ):
+        raise RecordingError(
+            f"{raw.origin}: columns {', '.join(ratios)} change {DEGREES:.1f} times as fast as their rates say, as if in "
+            f"degrees; radians are right{raw.conversion(next(iter(ratios)), '*pi/180')}"
+        )
     for unit, seconds in UNITS_S.items():
         # With one ratio alone, the position may be in another unit instead.
         if len(ratios) > 1 and all(0.8 < ratio / seconds < 1.25 for ratio in ratios.values()):
@@ -199,7 +214,7 @@ def _check_rate(raw: RawEpisode, variable: Variable, rate: Variable, stride: int
         raise RecordingError(
             f"{raw.cell(row, variable.name)} is {values[row]:g} {variable.unit}, and it changes by up to "
             f"{np.abs(coarse).max():.3g} {rate.unit}; {right}{raw.conversion(variable.name, to_ours)}; or is the clock "
-            "not in seconds?"
+            f"not in seconds, or the range of {rate.name} ({rate.low:g} to {rate.high:g}) too narrow?"
         )
     if measured is None:
         return

@@ -270,6 +270,22 @@ def _at(system: System, state: Tensor) -> str:
     return ", ".join(f"{of.name} {value:.3g}" for of, value in zip(system.states, state.tolist(), strict=True))
 
 
+def unused_commands(system: System) -> list[str]:
+    """Commands that change no rate, in states drawn from the ranges.
+
+    >>> import visadapt as va
+    >>> unused_commands(va.CartPole())
+    []
+    """
+    state, command, load = inputs(system, MANY_ROWS)
+    rates = system.derivative(state, command, load)
+    return [
+        action.name
+        for action, unit in zip(system.actions, torch.eye(command.shape[1]).to(command), strict=True)
+        if torch.equal(rates, system.derivative(state, command + (CHANGE - 1) * action.largest * unit, load))
+    ]
+
+
 def unused_parameters(system: System) -> list[str]:
     """Parameters that change no rate, in states drawn from the ranges.
 

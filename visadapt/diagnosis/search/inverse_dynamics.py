@@ -55,8 +55,16 @@ class Motion:
         return smoothed(values, deviations * self.smoothing / self.period)
 
     def rate(self, values: Tensor) -> Tensor:
-        """Derivative by time of values (T, ...)."""
-        return torch.gradient(values, spacing=self.period, dim=0)[0]
+        """Derivative by time of values (T, ...): of the parabola through three instants at the ends and next to them,
+        of the quartic through five elsewhere.
+
+        Three would lose 3 % of an oscillation at a fifteenth of the rate of the instants; the mean of its products, as
+        in a centrifugal force, would then look like a push.
+        """
+        out = torch.gradient(values, spacing=self.period, dim=0, edge_order=2)[0]
+        near, far = values[3:-1] - values[1:-3], values[4:] - values[:-4]
+        out[2:-2] = (8 * near - far) / (12 * self.period)
+        return out
 
     def acceleration(self, state: Tensor, acting: Tensor) -> Tensor:
         """(T, J) accelerations of the joints by the world."""
@@ -114,7 +122,10 @@ def motion_of(episode: Episode, world: World, measured: Sequence[int], period: f
     acting = _mean_commands(world.actuate(given[None], held[None])[0].mean(1), stamps, held, time, period)
     motion = Motion(world, period, smoothing, time, state, acting, torch.zeros(0))
     positions = [position for position, _ in world.system.coordinates]
-    state[:, positions] = motion.smooth(state[:, positions], 0.1)
+    read = state[:, positions]
+    once = motion.smooth(read, 0.1)
+    # Twicing (Tukey 1977, Exploratory Data Analysis, chapter 16): what smoothing takes from fast motion is given back.
+    state[:, positions] = once + motion.smooth(read - once, 0.1)
     state[:, motion.velocities] = motion.rate(state[:, positions])
     return replace(motion, measured=motion.rate(state[:, motion.velocities]))
 

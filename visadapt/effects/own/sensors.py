@@ -16,9 +16,9 @@ from visadapt.systems.contract import ROUNDING, inputs
 
 
 def on_sensors(system: type[System]) -> Iterator[Made]:
-    """Offset, scale and delay of each sensor (velocities share scale and delay of positions), and a delay of all."""
+    """Offset, scale and delay of each sensor (velocities share scale and delay of their positions), and a delay of
+    all."""
     rates = system.velocity_of()
-    velocities = [velocity for _, velocity in system.coordinates]
     moving = {"positions": list(rates), "velocities": list(rates.values())}
     yield (
         f"{ALL_SENSORS}.measurement_delay",
@@ -40,7 +40,7 @@ def on_sensors(system: type[System]) -> Iterator[Made]:
                 "order": sensing.AngleOffset.order,
             },
         )
-        if column in velocities:
+        if column in rates.values():
             continue
         scaled = [column, rates[column]] if column in rates else [column]
         both = ", ".join(system.states[one].name for one in scaled)
