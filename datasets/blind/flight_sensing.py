@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from datasets.blind.flight_plants import Array, Parameters
 
@@ -24,7 +25,7 @@ def sensed(p: Parameters, states: Array, path: Array, h: float) -> Array:
     return out
 
 
-def with_losses(rows: Array, lost: Array) -> Array:
+def with_losses(rows: Array, lost: NDArray[np.bool_]) -> Array:
     """Readings (rows, N, 13) of which each that is `lost` (rows, N) repeats the one before; never the first."""
     out = rows.copy()
     for row in range(1, len(rows)):

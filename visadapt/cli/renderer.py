@@ -39,6 +39,9 @@ CALIBRATION_STATES, CALIBRATION_RANGE = 4000, (1.0, 0.35)
 FAINT = 20 / 255
 """Difference from the background up to which a pixel shows neither cart nor pole."""
 
+NOT_LEARNT = 0.4
+"""Error where cart and pole are, over how far they stand out, above which they are not where they are drawn."""
+
 DRAWN_AT_ONCE = 64  # Frames, which bounds the memory that drawing takes
 
 HELD_OUT_EVERY = 10
@@ -68,18 +71,43 @@ def run(options: argparse.Namespace) -> None:
         with torch.no_grad():
             poses = zip(x[held_out].split(DRAWN_AT_ONCE), theta[held_out].split(DRAWN_AT_ONCE), strict=True)
             drawn = torch.cat([renderer(*each) for each in poses])
-        residual = frames[held_out] / 255 - drawn
+        seen = frames[held_out] / 255
+        residual = seen - drawn
+        # Almost all of a frame is background, which says nothing of a pole that is missing.
+        background = renderer.background.detach().sigmoid()
+        contrast = torch.maximum((seen - background).abs(), (drawn - background).abs())
+        error = _error_where_it_moves(residual, contrast)
         with replacing(out) as temporary:
             save_renderer(temporary, renderer, {**settings, "error": size_of(structure(residual))})
-    # Almost all of a frame is background, which says nothing of a pole that is missing.
-    background = renderer.background.detach().sigmoid()
-    is_moving_part = torch.maximum((frames[held_out] / 255 - background).abs(), (drawn - background).abs()) > FAINT
-    error = 255 * residual[is_moving_part].abs().mean()
     column, row = renderer.origin.tolist()
     print(
         f"{out}: {error:.2f} grey levels of 255 off where cart and pole are, on average, in {len(drawn)} frames left "
         f"out of the training; hinge at {column:.1f},{row:.1f} px, {renderer.gain[0]:.1f} px a metre"
     )
+
+
+def _error_where_it_moves(residual: Tensor, contrast: Tensor) -> float:
+    """Grey levels of 255 by which drawn frames differ from those seen where cart and pole are, on average; of the
+    differences (N, H, W) of these frames, and of both from the background.
+
+    Raises:
+        InputError: nothing moves, or cart and pole are not where they are drawn.
+    """
+    moves = contrast > FAINT
+    if not moves.any():
+        raise InputError(
+            f"nothing in the frames stands out from the background by more than {255 * FAINT:.0f} grey levels of 255: "
+            "frames in which cart and pole are lighter or darker are right"
+        )
+    error, stands_out = (255 * float(each[moves].abs().mean()) for each in (residual, contrast))
+    if error > NOT_LEARNT * stands_out:
+        raise InputError(
+            f"the renderer has not learnt to draw these frames: where cart and pole are, it is {error:.0f} grey levels "
+            f"off, and they stand out by {stands_out:.0f}. Are the states those of the frames (row by row, x to the "
+            "right, theta clockwise from upright, in m and rad), and --hinge, --scale and --pole near those of the "
+            "camera? Or are --iterations too few?"
+        )
+    return error
 
 
 def _check(options: argparse.Namespace, x: Tensor, frames: Tensor) -> None:
@@ -124,6 +152,12 @@ def _from_recordings(paths: list[str]) -> tuple[Tensor, Tensor, Tensor]:
                 raise InputError(f"{path}: has no state {name!r}; it has {', '.join(names)}")
         pose = [names.index("x"), names.index("theta")]
         episodes = read_recording(path)
+        widths = {episode.state.shape[1] for episode in episodes if episode.state is not None}
+        if widths - {len(names)}:
+            raise InputError(
+                f"{path}: states of {max(widths)} columns, which are not named; the attribute state_names says which "
+                'they are, as in "x,theta"'
+            )
         for number, episode in enumerate(episodes):
             where = f"{path}, episode {number}"
             if episode.state is None or episode.frame is None:

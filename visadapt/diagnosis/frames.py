@@ -73,6 +73,11 @@ LEAST_EXPLAINED = 0.2
 LONGEST_MISS = 0.5
 """s without a usable frame after which an episode is split: upright, errors grow by a factor e in about 0.25 s."""
 
+FEWEST_TO_ORDER = 20
+"""Frames of an episode from which their order is judged: by chance, fewer may jump about."""
+SURE_STEPS = 20.0
+"""Steps from frame to frame, over RESOLUTION, that no error of the poses makes."""
+
 FEWEST_POSES = 5  # Usable frames of a part of an episode; parts with fewer are left out
 
 
@@ -148,7 +153,8 @@ def with_camera(motion: Diagnosis, film: Film, system: System) -> Diagnosis:
         before, after = 255 * camera.unchanged.misfit, 255 * camera.best.misfit
         floor = min(255 * camera.noise, after)
         gap, following = Gap(MISFIT, before, after, floor, after, (before - after) / (before - floor)), ""
-        where = replace(where, regions=())  # of a gap that is none
+        stages = dict.fromkeys(where.stages, 0.0) | {Stage.CAMERA.value: 1.0}
+        where = replace(where, stages=stages, regions=())  # of a gap that is none
     return replace(
         motion,
         verdict=AMBIGUOUS if settled or motion.verdict == AMBIGUOUS else IDENTIFIED,
@@ -247,6 +253,7 @@ def positions(recording: Recording, found: Sequence[Poses]) -> tuple[Recording, 
     seen = [_seen(episode, poses) for episode, poses in zip(recording.episodes, found, strict=True)]
     clear = _clear(seen)
     _check_scene(recording, clear, found)
+    _check_order(recording, seen, clear)
     parts = list(_parts(recording, seen, clear))
     if not parts:
         raise FramesError(f"{recording.sources[0]}: no {FEWEST_POSES} frames close to each other are explained")
@@ -305,6 +312,20 @@ def _check_scene(recording: Recording, clear: Sequence[NDArray[np.bool_]], found
             f"they differ by {100 * contrast:.0f} % of the contrast, at most {100 * HIDDEN:.0f} % is right): it is of "
             "another scene; `visadapt renderer` trains one on frames of this one"
         )
+
+
+def _check_order(recording: Recording, seen: Sequence[_Seen], clear: Sequence[NDArray[np.bool_]]) -> None:
+    """Raises FramesError where cart and pole of an episode jump about from row to row, as no motion does."""
+    for poses, used, origin in zip(seen, clear, recording.sources, strict=True):
+        pose = poses.pose[used & poses.usual]
+        if len(pose) < FEWEST_TO_ORDER:
+            continue
+        spread, steps = pose.std(0), np.sqrt(np.square(np.diff(pose, axis=0)).mean(0))
+        if (steps > spread).all() and (steps > SURE_STEPS * np.array(RESOLUTION)).any():
+            raise FramesError(
+                f"{origin}: from frame to frame the cart jumps by {steps[0]:.2g} m and the pole by {steps[1]:.2g} rad, "
+                "root mean square, as no motion does: frames in the order of their rows are right"
+            )
 
 
 def _parts(

@@ -153,14 +153,13 @@ def _step(
     # Rounding to a resolution is noise with a deviation of resolution / sqrt(12).
     resolution = torch.tensor(model.rows.resolution, dtype=torch.float64)
     least = torch.tensor([LEAST_NOISE * model.system.states[k].largest for k in model.rows.channels]).double()
+    lowest_process = min_log_process(model.rows.period)
     lowest_noise = (resolution.square() / 12 + least.square()).log()
     return replace(
         fits,
         theta=theta,
         state=fits.state + (at.smoothed * weights[:, None, None, None]).sum(-1),
-        log_process=(fits.log_process + log_change[:, :groups]).clamp(
-            min_log_process(model.rows.period), MAX_LOG_PROCESS
-        ),
+        log_process=(fits.log_process + log_change[:, :groups]).clamp(lowest_process, MAX_LOG_PROCESS),
         log_noise=torch.maximum(fits.log_noise + noise_change, lowest_noise),
     )
 

@@ -177,15 +177,12 @@ def _check_clock(raw: RawEpisode, system: System) -> None:
         if rate is not None and rate.any():
             change = _rates(raw.time, values, system.states[system.index(name)].unit == "rad")
             ratios[name] = float(np.abs(change).mean() / np.abs(rate).mean())
-    angles = all(system.states[system.index(name)].unit == "rad" for name in ratios)
-    if (
-        angles
-        and len(ratios) > 1
-        and all(abs(math.log(ratio / DEGREES)) < SURE_OF_DEGREES for ratio in ratios.values())
-    ):
+    units = {system.states[system.index(name)].unit for name in ratios}
+    in_degrees = [abs(math.log(max(ratio, 1e-9) / DEGREES)) < SURE_OF_DEGREES for ratio in ratios.values()]
+    if len(ratios) > 1 and units == {"rad"} and all(in_degrees):
         raise RecordingError(
-            f"{raw.origin}: columns {', '.join(ratios)} change {DEGREES:.1f} times as fast as their rates say, as if in "
-            f"degrees; radians are right{raw.conversion(next(iter(ratios)), '*pi/180')}"
+            f"{raw.origin}: columns {', '.join(ratios)} change {DEGREES:.1f} times as fast as their rates say: they "
+            f"are in degrees; radians are right{raw.conversion(next(iter(ratios)), '*pi/180')}"
         )
     for unit, seconds in UNITS_S.items():
         # With one ratio alone, the position may be in another unit instead.

@@ -124,7 +124,7 @@ def motion_of(episode: Episode, world: World, measured: Sequence[int], period: f
     positions = [position for position, _ in world.system.coordinates]
     read = state[:, positions]
     once = motion.smooth(read, 0.1)
-    # Twicing (Tukey 1977, Exploratory Data Analysis, chapter 16): what smoothing takes from fast motion is given back.
+    # What smoothing takes from fast motion is given back ("twicing", Tukey 1977, Exploratory Data Analysis, chapter 16).
     state[:, positions] = once + motion.smooth(read - once, 0.1)
     state[:, motion.velocities] = motion.rate(state[:, positions])
     return replace(motion, measured=motion.rate(state[:, motion.velocities]))
