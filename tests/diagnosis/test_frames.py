@@ -390,6 +390,14 @@ class TestBadInput:
         path = rewritten(still, frame=lambda frame: np.repeat(frame[:1], len(frame), 0))
         assert "frames are the same" in refused(capsys, path, "--renderer", RENDERER)
 
+    def test_frames_out_of_order(self, tmp_path, capsys):
+        time = 0.05 * np.arange(40)
+        frame = DrawnCartPole()(0.6 * np.sin(2 * time), 0.15 * np.cos(3 * time))
+        mixed = np.random.default_rng(0).permutation(40)
+        va.write_recording(tmp_path / "a.h5", [va.Episode(time=time, action=np.zeros((40, 1)), frame=frame[mixed])])
+        line = refused(capsys, tmp_path / "a.h5", "--renderer", RENDERER)
+        assert "as no motion does: frames in the order of their rows are right" in line
+
     def test_a_film_without_times_and_commands(self, tmp_path, capsys):
         (tmp_path / "run.mp4").write_bytes(b"\0\0\0\x18ftypmp42")
         assert "run.mp4: a video, which holds no commands: an HDF5 file" in refused(

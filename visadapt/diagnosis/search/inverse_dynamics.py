@@ -25,6 +25,8 @@ GAUSSIAN_REACH = 4  # Deviations at which a smoothing Gaussian is cut off
 SMOOTHING = 0.13
 """Deviation of the Gaussian that smooths the load, as a share of the prediction time; one period if that is longer."""
 
+DENSE = 5.0  # Instants within a deviation of the smoothing, from which on they are dense
+
 SHORTEST = 25  # Length over the smoothing's deviation below which an episode tells nothing of pushes
 
 
@@ -55,15 +57,16 @@ class Motion:
         return smoothed(values, deviations * self.smoothing / self.period)
 
     def rate(self, values: Tensor) -> Tensor:
-        """Derivative by time of values (T, ...): of the parabola through three instants at the ends and next to them,
-        of the quartic through five elsewhere.
+        """Derivative by time of values (T, ...): of the parabola through three instants; where these are DENSE, of the
+        quartic through five, but at the ends and next to them.
 
-        Three would lose 3 % of an oscillation at a fifteenth of the rate of the instants; the mean of its products, as
-        in a centrifugal force, would then look like a push.
+        Three lose 3 % of an oscillation at a fifteenth of the rate of the instants; the mean of its products, as in a
+        centrifugal force, would then look like a push. Five are noisier, which matters where few are smoothed together.
         """
         out = torch.gradient(values, spacing=self.period, dim=0, edge_order=2)[0]
-        near, far = values[3:-1] - values[1:-3], values[4:] - values[:-4]
-        out[2:-2] = (8 * near - far) / (12 * self.period)
+        if self.smoothing > DENSE * self.period:
+            near, far = values[3:-1] - values[1:-3], values[4:] - values[:-4]
+            out[2:-2] = (8 * near - far) / (12 * self.period)
         return out
 
     def acceleration(self, state: Tensor, acting: Tensor) -> Tensor:
@@ -124,7 +127,7 @@ def motion_of(episode: Episode, world: World, measured: Sequence[int], period: f
     positions = [position for position, _ in world.system.coordinates]
     read = state[:, positions]
     once = motion.smooth(read, 0.1)
-    # What smoothing takes from fast motion is given back ("twicing", Tukey 1977, Exploratory Data Analysis, chapter 16).
+    # What smoothing takes from fast motion is given back: "twicing" (Tukey 1977, Exploratory Data Analysis, ch. 16).
     state[:, positions] = once + motion.smooth(read - once, 0.1)
     state[:, motion.velocities] = motion.rate(state[:, positions])
     return replace(motion, measured=motion.rate(state[:, motion.velocities]))

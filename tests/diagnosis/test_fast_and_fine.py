@@ -1,0 +1,159 @@
+"""Machines that are fast within a row, that are small in SI units, or whose states have no position."""
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+import torch
+
+import visadapt as va
+from visadapt.estimation.integration_step import with_longest_step
+from visadapt.estimation.segments import cut
+from visadapt.systems import System, Variable
+from visadapt.world import World
+
+
+@dataclass(frozen=True)
+class SwungRod(System):
+    """Two rods in a chain in the plane, swung by a motor at the first joint: products of rates couple them."""
+
+    name = "swung_rod"
+    states: ClassVar[tuple[Variable, ...]] = (
+        Variable("shoulder", "rad", -3.0, 3.0),
+        Variable("elbow", "rad", -3.0, 3.0),
+        Variable("shoulder_rate", "rad/s", -12.0, 12.0),
+        Variable("elbow_rate", "rad/s", -15.0, 15.0),
+    )
+    actions: ClassVar[tuple[Variable, ...]] = (Variable("motor", "N m", -15.0, 15.0),)
+    loads: ClassVar[tuple[Variable, ...]] = (
+        Variable("shoulder_joint", "N m", -4.0, 4.0),
+        Variable("elbow_joint", "N m", -2.0, 2.0),
+    )
+    coordinates = ((0, 2), (1, 3))
+
+    def derivative(self, state, command, load):
+        q1, q2, v1, v2 = state.unbind(-1)
+        coupling, inner = 0.042, 0.026
+        m12 = inner + coupling * q2.cos()
+        m11 = 0.15 + 2 * coupling * q2.cos()
+        gravity = 1.18 * (q1 + q2).sin()
+        f1 = command[:, 0] + load[:, 0] + coupling * q2.sin() * (2 * v1 * v2 + v2**2) - 4.75 * q1.sin() - gravity
+        f2 = load[:, 1] - coupling * q2.sin() * v1**2 - gravity
+        determinant = m11 * inner - m12**2
+        return torch.stack((v1, v2, (inner * f1 - m12 * f2) / determinant, (m11 * f2 - m12 * f1) / determinant), -1)
+
+
+@dataclass(frozen=True)
+class Magnet(System):
+    """A ball held below a magnet by its current, which is the command."""
+
+    mass: float | torch.Tensor = 0.05  # kg
+    pull: float | torch.Tensor = 4e-5  # N m2/A2
+
+    name = "magnet"
+    prediction_time = 0.05
+    states: ClassVar[tuple[Variable, ...]] = (Variable("gap", "m", 0.002, 0.02), Variable("speed", "m/s", -0.5, 0.5))
+    actions: ClassVar[tuple[Variable, ...]] = (Variable("current", "A", 0.0, 4.0),)
+    loads: ClassVar[tuple[Variable, ...]] = (Variable("ball", "N", -0.2, 0.2),)
+    coordinates = ((0, 1),)
+
+    def derivative(self, state, command, load):
+        gap, speed = state.unbind(-1)
+        attraction = self.pull * (command[:, 0] / gap) ** 2
+        return torch.stack((speed, 9.81 + (load[:, 0] - attraction) / self.mass), -1)
+
+
+@dataclass(frozen=True)
+class Tank(System):
+    """A tank that a pump fills and that runs out through a hole."""
+
+    area: float | torch.Tensor = 0.02  # m2
+
+    name = "tank"
+    prediction_time = 60.0
+    states: ClassVar[tuple[Variable, ...]] = (Variable("level", "m", 0.02, 1.0),)
+    actions: ClassVar[tuple[Variable, ...]] = (Variable("pump", "V", 0.0, 12.0),)
+    loads: ClassVar[tuple[Variable, ...]] = (Variable("inflow", "m3/s", -1e-4, 1e-4),)
+    coordinates = ((None, 0),)
+
+    def derivative(self, state, command, load):
+        outflow = 1.2e-4 * (2 * 9.81 * state[:, 0].clamp(min=1e-3)).sqrt()
+        return ((4.5e-5 * command[:, 0] + load[:, 0] - outflow) / self.area)[:, None]
+
+
+def recorded(system, period, first, control, rows, noise, episodes=2):
+    """Recordings of a machine under `control` (row, state, generator) -> command, integrated in steps of a 40th of the
+    period."""
+    world, generator, out = World(system, (), period, substeps=40), torch.Generator().manual_seed(0), []
+    for _ in range(episodes):
+        at = world.start(torch.tensor([first], dtype=torch.float64))
+        states, actions = [], []
+        for row in range(rows):
+            action = torch.tensor([[control(row, at.state[0], generator)]], dtype=torch.float64)
+            states.append(at.state[0])
+            actions.append(action[0])
+            at = world.step(at, action)
+        state, action = torch.stack(states), torch.stack(actions)
+        state = state + torch.tensor(noise) * torch.randn(state.shape, generator=generator, dtype=torch.float64)
+        out.append(va.Episode(time=period * np.arange(rows), action=action.numpy(), state=state.numpy()))
+    return out
+
+
+def diagnosed(tmp_path, system, episodes):
+    names = [variable.name for variable in system.states]
+    va.write_recording(tmp_path / "run.h5", episodes, names)
+    recording = va.load_recording(tmp_path / "run.h5", system)
+    return va.diagnose(recording, World(system, (), recording.period))
+
+
+def sway(row, state, generator):
+    return 0.5 * np.sin(0.2 * row)
+
+
+def test_the_source_s_own_integration_is_no_cause(tmp_path):
+    system = SwungRod()
+    episodes = recorded(system, 0.04, [1.2, 1.0, 0.0, 0.0], sway, 100, [2e-4, 2e-4, 2e-3, 2e-3])
+    assert max(np.abs(episode.state[:, 3]).max() for episode in episodes) > 10
+    found = diagnosed(tmp_path, system, episodes)
+    assert found.verdict == "no_gap"
+
+
+def hold(row, state, generator):
+    gap, speed = state.tolist()
+    balance = gap * (0.05 * 9.81 / 4e-5) ** 0.5
+    wanted = 0.01 + 0.001 * np.sin(0.1 * row)
+    return float(
+        np.clip(balance + 600 * (gap - wanted) + 12 * speed + 0.02 * torch.randn((), generator=generator), 0, 4)
+    )
+
+
+def test_a_small_machine_s_mass_is_found_to_a_thousandth(tmp_path):
+    episodes = recorded(replace(Magnet(), mass=0.05 * 1.005), 0.002, [0.01, 0.0], hold, 400, [1e-5, 2e-3])
+    found = diagnosed(tmp_path, Magnet(), episodes)
+    assert found.verdict in ("identified", "ambiguous")
+    scales = {cause.effect: cause.parameters["scale"].value for cause in found.causes if "scale" in cause.parameters}
+    assert abs(scales["mass.scale"] - 1.005) < 5e-4
+
+
+def fill(row, state, generator):
+    return 5.0 + 4.0 * np.sin(0.02 * row) + 2.0 * (row // 25 % 2)
+
+
+def test_a_level_s_sensor_may_have_another_scale(tmp_path):
+    episodes = recorded(Tank(), 4.0, [0.3], fill, 300, [2e-3], episodes=1)
+    read = [replace(episode, state=1.1 * episode.state) for episode in episodes]
+    found = diagnosed(tmp_path, Tank(), read)
+    assert [cause.effect for cause in found.causes] == ["level.sensor_scale"]
+    assert abs(found.causes[0].parameters["scale"].value - 1.1) < 0.005
+
+
+def test_only_a_fast_motion_is_integrated_in_shorter_steps():
+    def longest(factor):
+        generator = torch.Generator().manual_seed(0)
+        state = factor * torch.randn(40, 4, generator=generator, dtype=torch.float64)
+        clock, commands = 0.04 * torch.arange(40.0).double(), torch.zeros(40, 1).double()
+        rows = cut([state], [torch.ones_like(state)], [commands], [clock], (0, 1, 2, 3), 0.04, 40)
+        return with_longest_step(rows, SwungRod()).longest_step
+
+    assert longest(0.1) == float("inf")
+    assert longest(5.0) < 0.011
