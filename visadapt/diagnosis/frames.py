@@ -36,6 +36,7 @@ from visadapt.diagnosis.words import MISFIT, estimate
 from visadapt.effects import (
     EFFECTS,
     AngleDelay,
+    CameraEffect,
     CameraShift,
     Dropout,
     FrameDrop,
@@ -61,9 +62,10 @@ are off by 0.14 mm and 0.23 mrad (root mean square), with scales off by up to 0.
 UNSEEN = (Dropout, FrozenZone, MeasurementDelay, PositionDelay, AngleDelay)
 """Faults of separate sensors, which a camera cannot have: one frame shows cart and pole at the same instant."""
 
-MIN_MOTION_ERROR = 1.0
-"""Error of the source's predictions, over the noise of positions, from which motion shows a gap. Below, it may be the
-renderer's own error, which is no noise, and is larger where a moved camera's frames are interpolated."""
+MIN_MOTION_ERROR, MIN_MOTION_ERROR_MOVED = 1.0, 2.0
+"""Error of the source's predictions, over the noise of positions, from which motion shows a gap, and the same where the
+camera was moved. Below, it may be the renderer's own error, which is no noise, and is larger where frames are
+interpolated: a milliradian of the angle, which would pass for an offset."""
 
 VAGUE = 3.0  # Standard deviation of a pose, over the median, above which a frame does not show it
 
@@ -129,7 +131,8 @@ def with_camera(motion: Diagnosis, film: Film, system: System) -> Diagnosis:
     """
     camera = film.camera
     causes = camera.causes()
-    if motion.gap.before < MIN_MOTION_ERROR:
+    moved = any(type(effect).motion is not CameraEffect.motion for effect in camera.best.effects)
+    if motion.gap.before < (MIN_MOTION_ERROR_MOVED if moved else MIN_MOTION_ERROR):
         motion = _without_gap(motion, bool(causes), system)
     motion = replace(
         motion,
