@@ -4,7 +4,7 @@ import pytest
 import torch
 
 import visadapt as va
-from tests.cli.commands import refused, run, write_frames
+from tests.cli.commands import GUESS, refused, run, write_frames
 from visadapt import progress
 from visadapt.diagnosis import planning
 from visadapt.diagnosis.search import camera
@@ -214,7 +214,7 @@ def test_a_renderer_that_the_policy_was_not_trained_with(here, trained, capsys):
     command = ("adapt", "--policy", trained / "frames.safetensors", "--target", "rig:filmed", *SMALL)
     assert "the policy was not trained with this renderer" in refused(capsys, *command)
     write_frames(here / "a.h5", 40)
-    other = ("--hinge", "22,28", "--scale", 15, "--iterations", 3, "--out", "other.safetensors")
+    other = (*GUESS, "--iterations", 60, "--out", "other.safetensors")
     assert run("renderer", "a.h5", *other) == 0
     line = refused(capsys, *command, "--renderer", "other.safetensors")
     assert "the policy was not trained with this renderer: give the one that" in line

@@ -26,7 +26,7 @@ class AttitudeOffset(SensingEffect):
     systems = (Quadrotor, FixedWing)
     equation = "R measured = R R(roll, pitch, yaw), omega measured = R(roll, pitch, yaw)^T omega"
     source = "Stevens, Lewis and Johnson (2016), Aircraft Control and Simulation, section 1.3 (rotation matrices)"
-    table = tuple(Parameter(angle, "rad", -0.3, 0.3, 0.0, linear=True) for angle in ("roll", "pitch", "yaw"))
+    table = tuple(Parameter(angle, "rad", -0.3, 0.3, 0.0) for angle in ("roll", "pitch", "yaw"))
 
     def apply_to(self, measured: Tensor, memory: Tensor, period: float, generator: torch.Generator | None) -> Reading:
         angles = torch.stack([self.value(parameter.name, measured) for parameter in self.table], -1)
