@@ -129,6 +129,7 @@ def diagnose(
             recording.samples,
             float(f"{recording.period:.9g}"),
             tuple(printable(origin) for origin in used.sources),
+            measured.errors.noise(system, explored.prepared.rows.channels),
         ),
         verdict=verdict,
         where=Where(

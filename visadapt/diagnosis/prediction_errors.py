@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from visadapt.diagnosis.result import Gap
+from visadapt.diagnosis.result import Gap, Noise
 from visadapt.diagnosis.search import heldout
 from visadapt.systems import System
 
@@ -40,6 +40,11 @@ class PredictionErrors:
             "measurement noise"
         )
         return Gap(measure, before, after, floor, box, heldout.closed(before, after, floor))
+
+    def noise(self, system: System, channels: Sequence[int]) -> dict[str, Noise]:
+        """The noise of each state that was read."""
+        read = [system.states[channel] for channel in channels]
+        return {one.name: Noise(value, one.unit) for one, value in zip(read, self.deviation.tolist(), strict=True)}
 
     def by_state(self, system: System, channels: Sequence[int], explained: bool) -> dict[str, float]:
         """Share by state of the squared error above `after` if the causes explain the gap, else above the noise floor.

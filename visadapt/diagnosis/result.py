@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from numbers import Integral
 from pathlib import PurePath
 from typing import Any
@@ -160,13 +160,22 @@ class Gap:
 
 
 @dataclass(frozen=True)
+class Noise:
+    """Standard deviation of a sensor's noise."""
+
+    value: float
+    unit: str
+
+
+@dataclass(frozen=True)
 class RecordingSummary:
-    """Size of the recording."""
+    """Size of the recording, and its noise."""
 
     episodes: int
     samples: int  # actions that were executed
     period: float  # s between rows
     sources: tuple[str, ...] = ()  # file, and number there, of each episode
+    noise: Mapping[str, Noise] = field(default_factory=dict)  # of each state that was read, as the best model leaves it
 
     def episode(self, number: int) -> str:
         """An episode in words: its number, from 0, and where it comes from if there are several."""

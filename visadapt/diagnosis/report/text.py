@@ -16,6 +16,7 @@ from visadapt.diagnosis.result import (
     Cause,
     Diagnosis,
     Estimate,
+    Noise,
     Push,
     RecordingSummary,
     Region,
@@ -235,6 +236,14 @@ def shares(table: Mapping[str, float]) -> str:
     return ", ".join(f"{name} {percent(share)}" for name, share in table.items() if share > 0) or "none"
 
 
+def noises(every: Mapping[str, Noise]) -> str:
+    """Noise of the sensors in words, those with the same noise together: "x, y 0.012 m; z 0.020 m"."""
+    by_text: dict[str, list[str]] = {}
+    for name, one in every.items():
+        by_text.setdefault(with_unit(number(one.value, 2), one.unit), []).append(name)
+    return "; ".join(f"{', '.join(names)} {text}" for text, names in by_text.items())
+
+
 def rendered(template: str, diagnosis: Diagnosis, **values: Any) -> str:
     """A template of this folder, filled with a diagnosis and further values."""
     environment = jinja2.Environment(
@@ -243,7 +252,7 @@ def rendered(template: str, diagnosis: Diagnosis, **values: Any) -> str:
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
     )
-    for function in (plain, number, percent, closed, chance, estimate, interval, effects, shares, alone):
+    for function in (plain, number, percent, closed, chance, estimate, interval, effects, shares, alone, noises):
         environment.filters[function.__name__] = function
     environment.filters["either"] = lambda names: listed(names, "or")
     environment.filters["push"] = lambda one: push(one, diagnosis.recording)
