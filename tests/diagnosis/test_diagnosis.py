@@ -9,6 +9,7 @@ import torch
 
 from tests.diagnosed import NOISE, record
 from visadapt import diagnose
+from visadapt.diagnosis.report.text import as_text
 from visadapt.diagnosis.search.preparation import prepare
 from visadapt.diagnosis.words import A_ROW_LATE
 from visadapt.effects import (
@@ -82,6 +83,15 @@ def test_a_recording_of_the_source_has_no_gap(plain):
     assert result.verdict == "no_gap"
     assert result.causes == ()
     assert result.gap.before == pytest.approx(result.gap.floor, rel=0.05)
+
+
+def test_the_noise_of_each_sensor_that_was_read_is_said(plain):
+    found = diagnose(plain, SOURCE, ())
+    noise = found.recording.noise
+    assert noise.keys() == {"x", "theta"}
+    assert (noise["x"].unit, noise["theta"].unit) == ("m", "rad")
+    assert [one.value for one in noise.values()] == pytest.approx([0.002, 0.002], rel=0.15)
+    assert "noise, standard deviation: x 0.0" in as_text(found)
 
 
 def test_a_source_with_effects_is_refused_by_their_names(plain):
