@@ -259,7 +259,8 @@ class Search(FittedModels):
         To a set that explains all, they must add a little less than what one more effect costs in prior odds: the
         linear response then promises about what a fit gains.
         """
-        return self._promising(self.screening(base), math.log(len(self.catalogue)) if self.explains_all(base) else 0.0)
+        least = math.log(max(1, len(self.catalogue))) if self.explains_all(base) else 0.0
+        return self._promising(self.screening(base), least)
 
     def _promising(self, screened: Sequence[Candidate], least: float = 0.0) -> list[Candidate]:
         """The candidates that gain `least`, and what the system's profile asks for."""
