@@ -14,8 +14,8 @@ from visadapt.systems.integrators import steps_within
 from visadapt.world import World
 
 LARGEST_ERROR = 1e-5
-"""Root mean square error of integration over a row, over the range of the state: a hundredth of the error of an encoder
-of 4,096 counts, and less than the noise of most sensors in a row."""
+"""Root mean square error of integration over a row, as a share of the largest size in the state's range: of an angle of
+half a turn, a fifteenth of the error of an encoder of 4,096 counts."""
 
 MOST_SUBSTEPS = 32  # In a row
 

@@ -34,8 +34,6 @@ MOST_RATE_RANGES = 3.0
 """Rates above this multiple of the system's stated range are taken to be in another unit."""
 SMALL_COMMAND = 0.01
 """Share of its range within which a command that stays there is asked about."""
-DEGREES = 180 / math.pi
-"""In a radian."""
 SURE_OF_DEGREES = 0.023
 """Half of the distance, in the logarithm, from the degrees in a radian to the seconds in a minute."""
 IS_RATE_CORRELATION, NOT_RATE_CORRELATION = 0.8, 0.3
@@ -178,10 +176,10 @@ def _check_clock(raw: RawEpisode, system: System) -> None:
             change = _rates(raw.time, values, system.states[system.index(name)].unit == "rad")
             ratios[name] = float(np.abs(change).mean() / np.abs(rate).mean())
     units = {system.states[system.index(name)].unit for name in ratios}
-    in_degrees = [abs(math.log(max(ratio, 1e-9) / DEGREES)) < SURE_OF_DEGREES for ratio in ratios.values()]
+    in_degrees = [abs(math.log(max(ratio, 1e-9) * DEGREE)) < SURE_OF_DEGREES for ratio in ratios.values()]
     if len(ratios) > 1 and units == {"rad"} and all(in_degrees):
         raise RecordingError(
-            f"{raw.origin}: columns {', '.join(ratios)} change {DEGREES:.1f} times as fast as their rates say: they "
+            f"{raw.origin}: columns {', '.join(ratios)} change {1 / DEGREE:.1f} times as fast as their rates say: they "
             f"are in degrees; radians are right{raw.conversion(next(iter(ratios)), '*pi/180')}"
         )
     for unit, seconds in UNITS_S.items():

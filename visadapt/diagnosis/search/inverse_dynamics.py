@@ -57,13 +57,13 @@ class Motion:
         return smoothed(values, deviations * self.smoothing / self.period)
 
     def rate(self, values: Tensor) -> Tensor:
-        """Derivative by time of values (T, ...): of the parabola through three instants; where these are DENSE, of the
-        quartic through five, but at the ends and next to them.
+        """Derivative by time of values (T, ...): central differences of three instants, and where they are DENSE of
+        five, but at the ends and next to them.
 
         Three lose 3 % of an oscillation at a fifteenth of the rate of the instants; the mean of its products, as in a
         centrifugal force, would then look like a push. Five are noisier, which matters where few are smoothed together.
         """
-        out = torch.gradient(values, spacing=self.period, dim=0, edge_order=2)[0]
+        out = torch.gradient(values, spacing=self.period, dim=0)[0]
         if self.smoothing > DENSE * self.period:
             near, far = values[3:-1] - values[1:-3], values[4:] - values[:-4]
             out[2:-2] = (8 * near - far) / (12 * self.period)
