@@ -133,6 +133,8 @@ def test_a_small_machine_s_mass_is_found_to_a_thousandth(tmp_path):
     assert found.verdict in ("identified", "ambiguous")
     scales = {cause.effect: cause.parameters["scale"].value for cause in found.causes if "scale" in cause.parameters}
     assert abs(scales["mass.scale"] - 1.005) < 5e-4
+    # Only the ratio of the two moves the ball.
+    assert "no motion tells another mass from another pull: measure mass by itself" in found.next_experiment
 
 
 def fill(row, state, generator):

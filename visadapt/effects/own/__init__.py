@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cache
+from itertools import combinations
 from typing import Any
 
 import torch
@@ -53,7 +54,7 @@ def _made(system: type[System]) -> tuple[type[Effect], ...]:
     example = system()
     makers = on_commands, on_joints, on_states, on_parameters, on_sensors
     every = [one for maker in makers for one in maker(system)]
-    alike, imitating = list(_alike(example)), list(_imitating(example))
+    alike, imitating = list(_alike(example)), [*_imitating(example), *_in_ratio(example)]
     either_way = [*alike, *((other, one) for one, other in alike)]
     return tuple(_named(system, *each, _others(each[0], either_way), _others(each[0], imitating)) for each in every)
 
@@ -108,6 +109,25 @@ def _imitating(system: System) -> Iterator[tuple[str, str]]:
                 yield f"{field}.scale", f"{one.name}.viscous_friction"
 
 
+def _in_ratio(system: System) -> Iterator[tuple[str, str]]:
+    """Pairs of parameters of which, without loads, only the ratio or the product acts: a known load tells them apart."""
+    state, command, load = inputs(system)
+    fields, rest = scalable(system), torch.zeros_like(load)
+    free = system.derivative(state, command, rest)
+    rates = {
+        (field, factor): scaled.derivative(state, command, rest)
+        for field in fields
+        for factor in (2.0, 0.5)
+        if (scaled := _scaled(system, field, factor)) is not None
+    }
+    for one, other in combinations(fields, 2):
+        doubled = rates.get((one, 2.0))
+        if doubled is None or equal(doubled, free):
+            continue
+        if any(equal(rates[other, factor], doubled) for factor in (2.0, 0.5) if (other, factor) in rates):
+            yield f"{one}.scale", f"{other}.scale"
+
+
 def _scaled(system: System, field: str, factor: float) -> System | None:
     """The system with a factor on a parameter; None where it has no such value beside the others."""
     itself: Any = system
@@ -139,7 +159,12 @@ def _named(
     settled = {other: _MOTOR_OFF for other in alike if other.endswith(".constant_load")}
     settled |= {other: _COMMANDS_OFF for other in alike if other.endswith(".drift")}
     settled |= {other: _measured(other, "an actuator's gain") for other in alike if other.endswith(".scale")}
-    settled |= {other: _measured(name, _of_joint(other)) for other in imitating}
+    settled |= {
+        other: _measured(
+            name, f"another {other.removesuffix('.scale')}" if other.endswith(".scale") else _of_joint(other)
+        )
+        for other in imitating
+    }
     joint, _, kind = name.partition(".")
     if (alone := EFFECTS.get(kind)) is not None:  # what settles the library's own effects of the kind settles these
         settled |= {f"{joint}.{other}": text for other, text in alone.settled_by.items()}
