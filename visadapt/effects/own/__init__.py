@@ -110,7 +110,7 @@ def _imitating(system: System) -> Iterator[tuple[str, str]]:
 
 
 def _in_ratio(system: System) -> Iterator[tuple[str, str]]:
-    """Pairs of parameters of which, without loads, only the ratio or the product acts: a known load tells them apart."""
+    """Pairs of parameters of which only the ratio, or the product, acts, unless there are loads."""
     state, command, load = inputs(system)
     fields, rest = scalable(system), torch.zeros_like(load)
     free = system.derivative(state, command, rest)
@@ -159,20 +159,18 @@ def _named(
     settled = {other: _MOTOR_OFF for other in alike if other.endswith(".constant_load")}
     settled |= {other: _COMMANDS_OFF for other in alike if other.endswith(".drift")}
     settled |= {other: _measured(other, "an actuator's gain") for other in alike if other.endswith(".scale")}
-    settled |= {
-        other: _measured(
-            name, f"another {other.removesuffix('.scale')}" if other.endswith(".scale") else _of_joint(other)
-        )
-        for other in imitating
-    }
+    settled |= {other: _measured(name, _other_cause(other)) for other in imitating}
     joint, _, kind = name.partition(".")
     if (alone := EFFECTS.get(kind)) is not None:  # what settles the library's own effects of the kind settles these
         settled |= {f"{joint}.{other}": text for other, text in alone.settled_by.items()}
     return type(name, (base,), {"indistinguishable_from": alike, "settled_by": settled, **own, **attributes})
 
 
-def _of_joint(name: str) -> str:
+def _other_cause(name: str) -> str:
+    """An effect in words: "another mass", "viscous friction of shoulder"."""
     joint, _, kind = name.partition(".")
+    if kind == "scale":
+        return f"another {joint}"
     return f"{kind.replace('_', ' ')} of {joint}"
 
 
