@@ -122,9 +122,8 @@ def hold(row, state, generator):
     gap, speed = state.tolist()
     balance = gap * (0.05 * 9.81 / 4e-5) ** 0.5
     wanted = 0.01 + 0.001 * np.sin(0.1 * row)
-    return float(
-        np.clip(balance + 600 * (gap - wanted) + 12 * speed + 0.02 * torch.randn((), generator=generator), 0, 4)
-    )
+    noise = 0.02 * float(torch.randn((), generator=generator))
+    return float(np.clip(balance + 600 * (gap - wanted) + 12 * speed + noise, 0, 4))
 
 
 def test_a_small_machine_s_mass_is_found_to_a_thousandth(tmp_path):

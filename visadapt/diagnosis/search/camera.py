@@ -303,9 +303,9 @@ def _start(
     if not first.argmin():
         return neutral, best.pose
     chosen = points[first.argmin()]
-    spacing = torch.tensor([0.0 if p.name in fixed else (p.high - p.low) / (ON_GRID - 1) for p in kind.table])
-    if len(kind.table) > 1 and issubclass(kind, CameraShift):
+    if kind is CameraShift:
         # Marks along a track return: the grid may be nearer to a wrong one of them than to the right one.
+        spacing = torch.tensor([0.0 if p.name in fixed else (p.high - p.low) / (ON_GRID - 1) for p in kind.table])
         between = torch.cartesian_prod(*(torch.tensor([-1.0, 0.0, 1.0]) / 3 * each for each in spacing)).double()
         near = torch.cat([points[k] + between for k in first.argsort()[:REFINED].tolist()])
         chosen = near[misfits(near).argmin()]
