@@ -94,19 +94,25 @@ def test_a_system_may_import_a_file_beside_it_from_any_folder(rig, tmp_path, mon
     assert "arm_axis.coulomb_friction" in capsys.readouterr().out
 
 
-def test_a_parameter_that_the_derivative_does_not_use_is_named(rig, capsys):
-    unused = "    encoder_counts: float = 4096.0\n    gravity:"
-    (rig / "furuta.py").write_text(page_code()[0].replace("    gravity:", unused))
+@pytest.mark.parametrize(
+    ("old", "new", "line"),
+    [
+        (
+            "    gravity:",
+            "    encoder_counts: float = 4096.0\n    gravity:",
+            "encoder_counts changes no rate within the ranges: derivative does not use this parameter",
+        ),
+        (
+            '"voltage", "V", -10.0, 10.0),',
+            '"voltage", "V", -10.0, 10.0), va.Variable("brake", "V", 0.0, 5.0),',
+            "brake    changes no rate within the ranges: derivative does not use this command",
+        ),
+    ],
+    ids=["parameter", "command"],
+)
+def test_what_the_derivative_does_not_use_is_named(rig, capsys, old, new, line):
+    (rig / "furuta.py").write_text(page_code()[0].replace(old, new))
     assert cli.main(["check", "furuta.py:Furuta"]) == 0
-    line = "encoder_counts changes no rate within the ranges: derivative does not use this parameter"
-    assert line in capsys.readouterr().out.splitlines()
-
-
-def test_a_command_that_the_derivative_does_not_use_is_named(rig, capsys):
-    spare = '"voltage", "V", -10.0, 10.0), va.Variable("brake", "V", 0.0, 5.0),'
-    (rig / "furuta.py").write_text(page_code()[0].replace('"voltage", "V", -10.0, 10.0),', spare))
-    assert cli.main(["check", "furuta.py:Furuta"]) == 0
-    line = "brake    changes no rate within the ranges: derivative does not use this command"
     assert line in capsys.readouterr().out.splitlines()
 
 

@@ -7,40 +7,11 @@ import numpy as np
 import torch
 
 import visadapt as va
+from tests.own_systems import DoublePendulum
 from visadapt.estimation.integration_step import with_longest_step
 from visadapt.estimation.segments import cut
 from visadapt.systems import System, Variable
 from visadapt.world import World
-
-
-@dataclass(frozen=True)
-class SwungRod(System):
-    """Two rods in a chain in the plane, swung by a motor at the first joint: products of rates couple them."""
-
-    name = "swung_rod"
-    states: ClassVar[tuple[Variable, ...]] = (
-        Variable("shoulder", "rad", -3.0, 3.0),
-        Variable("elbow", "rad", -3.0, 3.0),
-        Variable("shoulder_rate", "rad/s", -12.0, 12.0),
-        Variable("elbow_rate", "rad/s", -15.0, 15.0),
-    )
-    actions: ClassVar[tuple[Variable, ...]] = (Variable("motor", "N m", -15.0, 15.0),)
-    loads: ClassVar[tuple[Variable, ...]] = (
-        Variable("shoulder_joint", "N m", -4.0, 4.0),
-        Variable("elbow_joint", "N m", -2.0, 2.0),
-    )
-    coordinates = ((0, 2), (1, 3))
-
-    def derivative(self, state, command, load):
-        q1, q2, v1, v2 = state.unbind(-1)
-        coupling, inner = 0.042, 0.026
-        m12 = inner + coupling * q2.cos()
-        m11 = 0.15 + 2 * coupling * q2.cos()
-        gravity = 1.18 * (q1 + q2).sin()
-        f1 = command[:, 0] + load[:, 0] + coupling * q2.sin() * (2 * v1 * v2 + v2**2) - 4.75 * q1.sin() - gravity
-        f2 = load[:, 1] - coupling * q2.sin() * v1**2 - gravity
-        determinant = m11 * inner - m12**2
-        return torch.stack((v1, v2, (inner * f1 - m12 * f2) / determinant, (m11 * f2 - m12 * f1) / determinant), -1)
 
 
 @dataclass(frozen=True)
@@ -82,14 +53,14 @@ class Tank(System):
 
 
 def recorded(system, period, first, control, rows, noise, episodes=2):
-    """Recordings of a machine under `control` (row, state, generator) -> command, integrated in steps of a 40th of the
+    """Recordings of a machine under `control` (row, state, generator) -> commands, integrated in steps of a 40th of the
     period."""
     world, generator, out = World(system, (), period, substeps=40), torch.Generator().manual_seed(0), []
     for _ in range(episodes):
         at = world.start(torch.tensor([first], dtype=torch.float64))
         states, actions = [], []
         for row in range(rows):
-            action = torch.tensor([[control(row, at.state[0], generator)]], dtype=torch.float64)
+            action = torch.tensor([control(row, at.state[0], generator)], dtype=torch.float64)
             states.append(at.state[0])
             actions.append(action[0])
             at = world.step(at, action)
@@ -107,11 +78,11 @@ def diagnosed(tmp_path, system, episodes):
 
 
 def sway(row, state, generator):
-    return 0.5 * np.sin(0.2 * row)
+    return 0.5 * np.sin(0.2 * row), 0.0
 
 
 def test_the_source_s_own_integration_is_no_cause(tmp_path):
-    system = SwungRod()
+    system = DoublePendulum()
     episodes = recorded(system, 0.04, [1.2, 1.0, 0.0, 0.0], sway, 100, [2e-4, 2e-4, 2e-3, 2e-3])
     assert max(np.abs(episode.state[:, 3]).max() for episode in episodes) > 10
     found = diagnosed(tmp_path, system, episodes)
@@ -123,7 +94,7 @@ def hold(row, state, generator):
     balance = gap * (0.05 * 9.81 / 4e-5) ** 0.5
     wanted = 0.01 + 0.001 * np.sin(0.1 * row)
     noise = 0.02 * float(torch.randn((), generator=generator))
-    return float(np.clip(balance + 600 * (gap - wanted) + 12 * speed + noise, 0, 4))
+    return (np.clip(balance + 600 * (gap - wanted) + 12 * speed + noise, 0, 4),)
 
 
 def test_a_small_machine_s_mass_is_found_to_a_thousandth(tmp_path):
@@ -137,7 +108,7 @@ def test_a_small_machine_s_mass_is_found_to_a_thousandth(tmp_path):
 
 
 def fill(row, state, generator):
-    return 5.0 + 4.0 * np.sin(0.02 * row) + 2.0 * (row // 25 % 2)
+    return (5.0 + 4.0 * np.sin(0.02 * row) + 2.0 * (row // 25 % 2),)
 
 
 def test_a_level_s_sensor_may_have_another_scale(tmp_path):
@@ -152,9 +123,9 @@ def test_only_a_fast_motion_is_integrated_in_shorter_steps():
     def longest(factor):
         generator = torch.Generator().manual_seed(0)
         state = factor * torch.randn(40, 4, generator=generator, dtype=torch.float64)
-        clock, commands = 0.04 * torch.arange(40.0).double(), torch.zeros(40, 1).double()
+        clock, commands = 0.04 * torch.arange(40.0).double(), torch.zeros(40, 2).double()
         rows = cut([state], [torch.ones_like(state)], [commands], [clock], (0, 1, 2, 3), 0.04, 40)
-        return with_longest_step(rows, SwungRod()).longest_step
+        return with_longest_step(rows, DoublePendulum()).longest_step
 
     assert longest(0.1) == float("inf")
     assert longest(5.0) < 0.011

@@ -49,7 +49,7 @@ HELD_OUT_EVERY = 10
 
 
 def run(options: argparse.Namespace) -> None:
-    """Train the renderer, write it, and say how well it draws frames that it was not trained on."""
+    """Train the renderer, write it if it draws frames that it was not trained on, and say how well it does."""
     if bool(options.recording) == bool(options.target):
         raise InputError("give recordings, or a gymnasium environment by --target and --map")
     if options.recording and (options.map or options.show or options.within):
@@ -76,33 +76,23 @@ def run(options: argparse.Namespace) -> None:
         # Almost all of a frame is background, which says nothing of a pole that is missing.
         background = renderer.background.detach().sigmoid()
         contrast = torch.maximum((seen - background).abs(), (drawn - background).abs())
-        error = _error_where_it_moves(residual, contrast)
-        with replacing(out) as temporary:
-            save_renderer(temporary, renderer, {**settings, "error": size_of(structure(residual))})
-    column, row = renderer.origin.tolist()
-    print(
-        f"{out}: {error:.2f} grey levels of 255 off where cart and pole are, on average, in {len(drawn)} frames left "
-        f"out of the training; hinge at {column:.1f},{row:.1f} px, {renderer.gain[0]:.1f} px a metre"
-    )
-
-
-def _error_where_it_moves(residual: Tensor, contrast: Tensor) -> float:
-    """Grey levels of 255 by which drawn frames differ from those seen where cart and pole are, on average; of the
-    differences (N, H, W) of these frames, and of both from the background.
-
-    Raises:
-        InputError: cart and pole are not where they are drawn.
-    """
-    moves = contrast > FAINT
-    error, stands_out = (255 * float(each[moves].abs().mean()) for each in (residual, contrast))
-    if error > NOT_LEARNT * stands_out:
+        moves = contrast > FAINT
+        error, stands_out = (255 * float(each[moves].abs().mean()) for each in (residual, contrast))
+        if is_learnt := error <= NOT_LEARNT * stands_out:
+            with replacing(out) as temporary:
+                save_renderer(temporary, renderer, {**settings, "error": size_of(structure(residual))})
+    if not is_learnt:  # The training is of no use, and a better guess makes another one
         raise InputError(
             f"the renderer has not learnt to draw these frames: where cart and pole are, it is {error:.0f} grey levels "
             f"off, and they stand out by {stands_out:.0f}. Are the states those of the frames (row by row, x to the "
             "right, theta clockwise from upright, in m and rad), and --hinge, --scale and --pole near those of the "
             "camera? Or are --iterations too few?"
         )
-    return error
+    column, row = renderer.origin.tolist()
+    print(
+        f"{out}: {error:.2f} grey levels of 255 off where cart and pole are, on average, in {len(drawn)} frames left "
+        f"out of the training; hinge at {column:.1f},{row:.1f} px, {renderer.gain[0]:.1f} px a metre"
+    )
 
 
 def _check(options: argparse.Namespace, x: Tensor, frames: Tensor) -> None:

@@ -62,6 +62,6 @@ class PositioningDelay(LateSensors):
     systems = (Quadrotor, FixedWing)
     equation = "(x, y, z, x_dot, y_dot, z_dot) measured(t) = (x, y, z, x_dot, y_dot, z_dot)(max(t - delay, 0))"
     table = (Parameter("delay", "s", 0.0, 0.2, 0.0),)
-    positions: ClassVar[list[int]] = [0, 1, 2]
-    velocities: ClassVar[list[int]] = [3, 4, 5]
+    positions: ClassVar[list[int]] = [Quadrotor.index(axis) for axis in "xyz"]
+    velocities: ClassVar[list[int]] = [Quadrotor.index(f"{axis}_dot") for axis in "xyz"]
     late: ClassVar[list[int]] = [*positions, *velocities]

@@ -46,7 +46,7 @@ MAX_LOG_PROCESS = math.log(3.0**2)
 
 
 def min_log_process(period: float) -> float:
-    """Lower bound of the same on a clock with this period in s."""
+    """Lower bound of the log process noise variance of the driven velocities on a clock with this period in s."""
     return 2 * math.log(LEAST_DRIVE * min(1.0, period / LEAST_DRIVE_PERIOD))
 
 

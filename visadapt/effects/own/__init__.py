@@ -54,9 +54,9 @@ def _made(system: type[System]) -> tuple[type[Effect], ...]:
     example = system()
     makers = on_commands, on_joints, on_states, on_parameters, on_sensors
     every = [one for maker in makers for one in maker(system)]
-    alike, imitating = list(_alike(example)), [*_imitating(example), *_in_ratio(example)]
+    alike, by_measuring = list(_alike(example)), [*_imitating(example), *_in_ratio(example)]
     either_way = [*alike, *((other, one) for one, other in alike)]
-    return tuple(_named(system, *each, _others(each[0], either_way), _others(each[0], imitating)) for each in every)
+    return tuple(_named(system, *each, _others(each[0], either_way), _others(each[0], by_measuring)) for each in every)
 
 
 def _others(name: str, pairs: Sequence[tuple[str, str]]) -> tuple[str, ...]:
@@ -151,7 +151,7 @@ def _named(
     base: type[Effect],
     attributes: dict[str, Any],
     alike: tuple[str, ...],
-    imitating: tuple[str, ...],
+    by_measuring: tuple[str, ...],
 ) -> type[Effect]:
     # Where effects of two systems have the same name, the later ones replace the earlier in `EFFECTS`.
     own = {"__module__": system.__module__, "__qualname__": name, "name": name, "systems": (system,)}
@@ -159,7 +159,7 @@ def _named(
     settled = {other: _MOTOR_OFF for other in alike if other.endswith(".constant_load")}
     settled |= {other: _COMMANDS_OFF for other in alike if other.endswith(".drift")}
     settled |= {other: _measured(other, "an actuator's gain") for other in alike if other.endswith(".scale")}
-    settled |= {other: _measured(name, _other_cause(other)) for other in imitating}
+    settled |= {other: _measured(name, _other_cause(other)) for other in by_measuring}
     joint, _, kind = name.partition(".")
     if (alone := EFFECTS.get(kind)) is not None:  # what settles the library's own effects of the kind settles these
         settled |= {f"{joint}.{other}": text for other, text in alone.settled_by.items()}
