@@ -92,6 +92,30 @@ class Drive(System):
 
 
 @dataclass(frozen=True)
+class Motor(System):
+    """A motor that turns a wheel, whose speed alone is a state."""
+
+    inertia: float = 0.01  # kg m2
+    resistance: float = 1.0  # ohm
+    constant: float = 0.05  # N m/A
+    damping: float = 0.002  # N m s/rad
+
+    name = "motor_of_a_wheel"
+    states: ClassVar[tuple[Variable, ...]] = (Variable("speed", "rad/s", -150.0, 150.0),)
+    actions: ClassVar[tuple[Variable, ...]] = (Variable("voltage", "V", -12.0, 12.0),)
+    loads = (Variable("shaft", "N m", -0.2, 0.2),)
+    coordinates = ((None, 0),)
+
+    def __post_init__(self):
+        self.check_parameters(may_be_zero=("damping",))
+
+    def derivative(self, state, command, load):
+        current = (command[:, 0] - self.constant * state[:, 0]) / self.resistance
+        torque = self.constant * current + load[:, 0] - self.damping * state[:, 0]
+        return torch.stack((torque / self.inertia,), -1)
+
+
+@dataclass(frozen=True)
 class DoublePendulum(System):
     """Two uniform links on motors at shoulder and elbow; 0 hangs down, the second angle is relative to the first."""
 

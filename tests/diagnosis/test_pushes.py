@@ -10,7 +10,7 @@ import torch
 
 import visadapt as va
 from tests.diagnosed import record
-from tests.own_systems import DoublePendulum
+from tests.own_systems import DoublePendulum, Motor
 from visadapt.diagnosis import diagnose
 from visadapt.diagnosis.search.preparation import prepare
 from visadapt.diagnosis.search.pushes import pushes
@@ -103,7 +103,8 @@ def test_each_episode_has_its_own():
 
 def test_without_a_joints_position_none_are_looked_for():
     whole = recorded(ELBOW)
-    episode = dataclasses.replace(whole.episodes[0], state=whole.episodes[0].state[:, [0, 2, 3]])
+    first = whole.episodes[0]
+    episode = Episode(first.time[:450], first.action[:450], first.state[:450, [0, 2, 3]])
     less = dataclasses.replace(whole, episodes=(episode,), measured=("angle_1", "velocity_1", "velocity_2"))
     assert found_in(less) == ()
     assert unread_states(less, DoublePendulum()) == ["angle_2"]
@@ -113,6 +114,22 @@ def test_without_a_joints_position_none_are_looked_for():
     found = diagnose(less, World(DoublePendulum(), period=less.period), friction)
     assert found.verdict == "unexplained"
     assert warning in found.warnings
+
+
+@pytest.mark.parametrize("peak", [0.04, 0.0])
+def test_of_a_motor_its_measured_speed_shows_them(peak):
+    time = 0.01 * np.arange(600)
+    voltage = 8 * np.sign(np.sin(3 * time + 2 * np.sin(time)))
+    push = peak * np.exp(-0.5 * ((time - 3.3) / WIDTH) ** 2)
+    by_volt = Motor().constant / Motor().resistance
+    speed = states_under(World(Motor(), period=0.01).double(), [[0.0]], (voltage + push / by_volt)[:, None, None])[:, 0]
+    read = speed + np.random.default_rng(3).normal(size=speed.shape) * 0.1
+    recording = Recording((Episode(time, voltage[:, None], read),), ("speed",), 0.01, ("run",))
+    found = diagnose(recording, World(Motor(), period=0.01), ())
+    pushes = [(push.load, round(push.impulse / (WIDTH * math.sqrt(2 * math.pi)), 2)) for push in found.where.pushes]
+    assert pushes == ([("shaft", peak)] if peak else [])
+    assert found.verdict == ("unexplained" if peak else "no_gap")
+    assert unread_states(recording, Motor()) == []
 
 
 TIME = 0.02 * np.arange(250)

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from experiments.furuta import Furuta
-from tests.own_systems import Rover
+from tests.own_systems import Motor, Rover
 from visadapt.diagnosis import diagnose
 from visadapt.effects.catalogue import catalogue
 from visadapt.recordings import Episode, Recording, load_recording
@@ -212,28 +212,6 @@ def test_a_speed_without_a_position_has_no_spring_and_no_transmission():
     lacking = {"forward.spring", "forward.transmission_compliance"}
     assert not lacking & BY_NAME.keys()
     assert {one.replace("forward", "turn") for one in lacking} <= BY_NAME.keys()
-
-
-@dataclass(frozen=True)
-class Motor(System):
-    inertia: float = 0.01  # kg m2
-    resistance: float = 1.0  # ohm
-    constant: float = 0.05  # N m/A
-    damping: float = 0.002  # N m s/rad
-
-    name = "motor_of_a_wheel"
-    states: ClassVar[tuple[Variable, ...]] = (Variable("speed", "rad/s", -150.0, 150.0),)
-    actions: ClassVar[tuple[Variable, ...]] = (Variable("voltage", "V", -12.0, 12.0),)
-    loads = (Variable("shaft", "N m", -0.2, 0.2),)
-    coordinates = ((None, 0),)
-
-    def __post_init__(self):
-        self.check_parameters(may_be_zero=("damping",))
-
-    def derivative(self, state, command, load):
-        current = (command[:, 0] - self.constant * state[:, 0]) / self.resistance
-        torque = self.constant * current + load[:, 0] - self.damping * state[:, 0]
-        return torch.stack((torque / self.inertia,), -1)
 
 
 @dataclass(frozen=True)

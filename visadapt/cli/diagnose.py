@@ -14,7 +14,6 @@ from visadapt.cli.progress import progress
 from visadapt.cli.simulator import given_system
 from visadapt.diagnosis import Diagnosis
 from visadapt.diagnosis.planning import plan
-from visadapt.diagnosis.report.html import write_report
 from visadapt.diagnosis.report.text import as_text
 from visadapt.diagnosis.result import AMBIGUOUS
 from visadapt.diagnosis.words import printable
@@ -57,6 +56,8 @@ def run(options: argparse.Namespace) -> None:
             with replacing(options.json) as temporary:
                 temporary.write_text(json.dumps(result.to_json(), indent=2, allow_nan=False) + "\n", encoding="utf-8")
         if options.report:
+            from visadapt.diagnosis.report.html import write_report  # with matplotlib, which takes half a second
+
             write_report(options.report, result, _settings(options, system))
         if options.plan:
             said.append(_plan(options, result, recording, source, policy))

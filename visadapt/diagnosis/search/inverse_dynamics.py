@@ -1,7 +1,8 @@
 """The motion of an episode, at even instants, and the loads that it takes (inverse dynamics).
 
-Readings of positions are smoothed and differentiated twice; these accelerations, divided by the acceleration per unit
-of load, are loads (Khalil and Dombre 2002, Modeling, Identification and Control of Robots, chapter 12).
+Readings of positions are smoothed and differentiated twice, those of velocities whose joint has no position once; these
+accelerations, divided by the acceleration per unit of load, are loads (Khalil and Dombre 2002, Modeling, Identification
+and Control of Robots, chapter 12).
 """
 
 from __future__ import annotations
@@ -38,7 +39,9 @@ class Motion:
     period: float  # s
     smoothing: float  # s, deviation of the Gaussian that smooths its loads
     time: Tensor  # (T,) s since the episode began
-    state: Tensor  # (T, n) of positions slightly smoothed, and velocities that are their rates
+    state: Tensor
+    """(T, n) of positions slightly smoothed, and velocities that are their rates; of joints without a position, of
+    velocities slightly smoothed"""
     acting: Tensor  # (T, n_action) commands as the world makes them act
     measured: Tensor  # (T, J) accelerations of the joints
 
@@ -124,12 +127,13 @@ def motion_of(episode: Episode, world: World, measured: Sequence[int], period: f
     held = torch.cat((stamps.diff(), stamps.new_tensor([period])))
     acting = _mean_commands(world.actuate(given[None], held[None])[0].mean(1), stamps, held, time, period)
     motion = Motion(world, period, smoothing, time, state, acting, torch.zeros(0))
-    positions = [position for position, _ in world.system.coordinates]
-    read = state[:, positions]
-    once = motion.smooth(read, 0.1)
+    read = [velocity if position is None else position for position, velocity in world.system.coordinates]
+    once = motion.smooth(state[:, read], 0.1)
     # What smoothing takes from fast motion is given back: "twicing" (Tukey 1977, Exploratory Data Analysis, ch. 16).
-    state[:, positions] = once + motion.smooth(read - once, 0.1)
-    state[:, motion.velocities] = motion.rate(state[:, positions])
+    state[:, read] = once + motion.smooth(state[:, read] - once, 0.1)
+    for position, velocity in world.system.coordinates:
+        if position is not None:
+            state[:, velocity] = motion.rate(state[:, position])
     return replace(motion, measured=motion.rate(state[:, motion.velocities]))
 
 

@@ -84,10 +84,14 @@ def _of_position(motion: Motion, sliding: Motion, joint: int) -> Iterator[Column
         motion.measured[:, joint, None] * _on(motion, joint),
         (_on(motion, joint)[:, None] * motion.by_world[1][:, joint, None, :]),
     )
+    position, velocity = motion.world.system.coordinates[joint]
+    if position is None:
+        return
     state, acting, commanded = motion.state, motion.acting, motion.commanded
     slides = sliding.acceleration(state, acting)
-    moved = [_moved(state, column) for column in motion.world.system.coordinates[joint] if column is not None]
-    slopes = [(sliding.acceleration(each, acting) - slides) / DIFFERENCE for each in moved]
+    slopes = [
+        (sliding.acceleration(_moved(state, column), acting) - slides) / DIFFERENCE for column in (position, velocity)
+    ]
     largest = torch.tensor([action.largest for action in motion.world.system.actions], dtype=state.dtype)
     slack = (commanded / (SLACK * largest)).tanh()
     for error in (torch.ones_like(state[:, 0]), *commanded.unbind(1), *slack.unbind(1)):

@@ -82,7 +82,7 @@ class LoadTrack:
 
 
 def load_tracks(recording: Recording, worlds: Sequence[World], known: SmoothFunction | None = None) -> list[LoadTrack]:
-    """The unexplained loads in each episode that is long enough; none where a joint's position was not measured.
+    """The unexplained loads in each episode that is long enough; none where `unread_states` has any.
 
     Args:
         worlds: what explains each episode.
@@ -121,15 +121,12 @@ def load_tracks(recording: Recording, worlds: Sequence[World], known: SmoothFunc
 
 
 def unread_states(recording: Recording, system: System) -> list[str]:
-    """What the unexplained load needs and no sensor read: positions of joints, and states that belong to no joint."""
+    """What the unexplained load needs and no sensor read: positions of joints, velocities of those that have no
+    position, and states that belong to no joint."""
     if not has_joints(system):
         return []
-    joints = zip(system.coordinates, system.loads, strict=True)
-    positions = [
-        f"a position of {load.name}" if position is None else system.states[position].name
-        for (position, _), load in joints
-    ]
-    needed = [*positions, *(system.states[column].name for column in system.outside_joints())]
+    of_joints = [velocity if position is None else position for position, velocity in system.coordinates]
+    needed = [system.states[column].name for column in (*of_joints, *system.outside_joints())]
     return [name for name in needed if name not in recording.measured]
 
 
