@@ -61,7 +61,7 @@ def find_repeats(
     of_angle = torch.tensor([c in angle_sensor for c in channels], dtype=torch.bool)
     angle = channels.index(angle_sensor[0]) if angle_sensor and angle_sensor[0] in channels else None
     same = [torch.stack([_repeats(values[:, k], steps[k]) for k in range(len(channels))], 1) for values in measured]
-    resting = [_resting(values) for values in measured]
+    resting = [_resting(values, torch.tensor(steps).to(values)) for values in measured]
     whole_rows = [
         _equal(values).all(1) & each.any(1) & ~rest for values, each, rest in zip(measured, same, resting, strict=True)
     ]
@@ -101,10 +101,13 @@ def _equal(values: Tensor) -> Tensor:
     return torch.cat((torch.zeros_like(values[:1], dtype=torch.bool), values.diff(dim=0) == 0))
 
 
-def _resting(values: Tensor) -> Tensor:
-    """Which rows (T, m) repeat the first one of an episode, where these are too many to have been lost: it rests."""
+def _resting(values: Tensor, steps: Tensor) -> Tensor:
+    """Which rows (T, m) repeat the first one of an episode because the machine rests: they are too many to have been
+    lost, or not every sensor, of resolutions `steps` (m,), leaves them at speed."""
     still = (values == values[:1]).all(1).cumprod(0) > 0
-    return still if int(still.sum()) > MIN_REST_ROWS else torch.zeros_like(still)
+    count = int(still.sum())
+    leaves = (values[count : count + 1] - values[:1]).abs() > MIN_JUMP_STEPS * steps
+    return still if count > MIN_REST_ROWS or not leaves.all() else torch.zeros_like(still)
 
 
 def _repeats(readings: Tensor, step: float) -> Tensor:

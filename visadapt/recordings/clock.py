@@ -34,6 +34,9 @@ LONGEST_STEP_PERIODS = 3.0
 HARMLESS_GAP_S = 0.01
 """Step up to which an episode is never split: a loop of a few ms that stalls for so long holds its command."""
 SHORTEST_PERIOD_S = 1e-4
+BURST_STEP, LONGEST_BURST, FEWEST_IN_BURSTS = 0.25, 25, 30
+"""Rows come in bursts where the median step is below this share of the mean, and no row is further than this many rows
+from a steady clock; and the fewest steps with which this is tested."""
 LEAST_STEPS = 3
 """Steps in the time of a prediction, at least."""
 LEAST_STEP_PERIODS = 1e-3
@@ -153,8 +156,24 @@ def check_steps(episodes: Sequence[RawEpisode], system: System) -> None:
             )
 
 
-def uninterrupted(raw: RawEpisode, note: Note) -> list[RawEpisode]:
-    """The episode in parts without missing rows; `time` counts from the start of the whole episode."""
+def without_bursts(raw: RawEpisode, note: Note) -> RawEpisode:
+    """The episode on a steady clock where its rows are stamped as they arrived, several at once."""
+    steps = np.diff(raw.time)
+    if len(steps) < FEWEST_IN_BURSTS or np.median(steps) > BURST_STEP * steps.mean():
+        return raw
+    index, newest = np.arange(len(raw.time)), np.flatnonzero(steps > steps.mean())  # the last of each burst
+    period, start = np.polyfit(newest, raw.time[newest], 1)
+    if np.abs(raw.time - start - period * index).max() > LONGEST_BURST * period:
+        return raw
+    note(
+        f"rows arrive in bursts and are stamped as they arrive: they were taken to be {period:.4g} s apart", raw.origin
+    )
+    return replace(raw, time=raw.time[0] + period * index)
+
+
+def uninterrupted(raw: RawEpisode, note: Note, jumps: Sequence[int] = ()) -> list[RawEpisode]:
+    """The episode in parts without missing rows, split at `jumps` too; `time` counts from the start of the whole
+    episode."""
     raw = replace(raw, time=raw.time - raw.time[0])
     steps = np.diff(raw.time)
     if len(steps) == 0:
@@ -167,7 +186,16 @@ def uninterrupted(raw: RawEpisode, note: Note) -> list[RawEpisode]:
     cuts = (np.flatnonzero(long if irregular else long & gaps) + 1).tolist()
     for cut in cuts:
         note("rows are missing here; the episode was split", f"{raw.origin}, {raw.place(cut)}")
-    return [_clocked(raw.part(start, end), note) for start, end in pairwise([0, *cuts, len(raw.time)])]
+    edges = sorted({0, *cuts, *jumps, len(raw.time)})
+    parts = [_clocked(raw.part(start, end)) for start, end in pairwise(edges)]
+    unsteady = np.concatenate([steps for part in parts if _is_unsteady(steps := np.diff(part.time), period)] or [[]])
+    if len(unsteady):
+        note(f"an unsteady clock: its steps last {unsteady.min():.3g} to {unsteady.max():.3g} s", raw.origin)
+    return parts
+
+
+def _is_unsteady(steps: NDArray[np.float64], period: float) -> bool:
+    return len(steps) > 1 and bool(np.ptp(steps) > UNSTEADY_PERIODS * period)
 
 
 def _later_by(time: NDArray[np.float64], period: float) -> NDArray[np.float64]:
@@ -180,7 +208,7 @@ def _later_by(time: NDArray[np.float64], period: float) -> NDArray[np.float64]:
     return later
 
 
-def _clocked(part: RawEpisode, note: Note) -> RawEpisode:
+def _clocked(part: RawEpisode) -> RawEpisode:
     """The part on a steady clock where its stamps deviate by no more than their rounding; else with its own stamps.
 
     The diagnosis decides whether unsteady stamps are those of the readings, or of a log that wrote them late.
@@ -192,9 +220,6 @@ def _clocked(part: RawEpisode, note: Note) -> RawEpisode:
     off = part.time - (start + period * index)
     if np.abs(off).max() <= ROUNDING_ERROR * _rounding(part.time):
         return replace(part, time=part.time[0] + period * index)
-    steps = np.diff(part.time)
-    if np.ptp(steps) > UNSTEADY_PERIODS * period:
-        note(f"an unsteady clock: its steps last {steps.min():.3g} to {steps.max():.3g} s", part.origin)
     return part
 
 

@@ -14,15 +14,24 @@ import numpy as np
 
 from visadapt.progress import Report, staged
 from visadapt.recordings.checks import check_commands, check_finite, check_units
-from visadapt.recordings.clock import Note, RawEpisode, check_forward, check_steps, uninterrupted, with_common_period
+from visadapt.recordings.clock import (
+    Note,
+    RawEpisode,
+    check_forward,
+    check_steps,
+    uninterrupted,
+    with_common_period,
+    without_bursts,
+)
 from visadapt.recordings.columns import convert, match
 from visadapt.recordings.csv import read_rows
 from visadapt.recordings.episode import Episode, Recording, RecordingError
+from visadapt.recordings.faulty_readings import jumps, without_outliers
 from visadapt.recordings.ground import in_flight
 from visadapt.recordings.hdf5 import read_names, read_stretches
 from visadapt.recordings.logs import read_log
 from visadapt.recordings.physics import is_in_newtons, same_after_a_turn
-from visadapt.recordings.sensors import TURN, check_sensors, without_outliers
+from visadapt.recordings.sensors import TURN, check_sensors
 from visadapt.recordings.thinning import thinned
 from visadapt.recordings.topics import reader
 from visadapt.systems import System
@@ -93,6 +102,7 @@ def load_recording(
         for raw in episodes:
             check_finite(raw, system.actions)
             check_forward(raw)
+        episodes = [without_bursts(raw, note) for raw in episodes]
         check_steps(episodes, system)
         whole += [without_outliers(raw, system, note) for raw in episodes]
     whole = [in_flight(raw, system, note) for raw in _commands(_shared(whole, system, note), system, note)]
@@ -102,7 +112,8 @@ def load_recording(
             check_units(list(of_file), system)
         whole = check_sensors(whole, system, note)
     turning = [state.name for state in system.states if state.unit == "rad" and same_after_a_turn(system, state.name)]
-    parts = [part for raw in whole for part in uninterrupted(_unwrapped(raw, turning), note)]
+    whole = [_unwrapped(raw, turning) for raw in whole]
+    parts = [part for raw in whole for part in uninterrupted(raw, note, () if frames else jumps(raw, system, note))]
     parts, period = with_common_period(_long_enough(parts, system.prediction_time, note), note)
     outliers = any(part.usable is not None for part in parts)
     return Recording(

@@ -1,4 +1,4 @@
-"""Checks of sensors: outliers are set aside, dead rates left out; dead or frozen positions and absurd values refused.
+"""Checks of sensors: dead rates are left out; dead or frozen positions and absurd values refused.
 
 Values that cannot have been measured must not be diagnosed: the diagnosis would find an effect that imitates them.
 """
@@ -20,14 +20,6 @@ from visadapt.systems import System, Variable
 
 TURN = 2 * np.pi
 
-OUTLIER_SCALES = 50.0
-"""Jump of a reading above which it may be an outlier, in usual departures from the mean of its neighbours."""
-OUTLIER_ROWS = 3
-"""Most consecutive rows that an outlier may last."""
-OUTLIER_RETURN = 0.2
-"""Share of a jump that may remain where the reading after an outlier counts as back at that before it."""
-MOST_OUTLIERS = 0.05
-"""Share of outliers among the rows of an episode above which the sensor is refused."""
 ABSURD_RANGES, ABSURD_TURNS = 100.0, 1e5
 """Multiples of the range that the system states, and turns of an angle, beyond which a reading is absurd."""
 STILL_RANGES = 1e-9
@@ -47,69 +39,6 @@ def differences(values: NDArray[np.float64], angle: bool) -> NDArray[np.float64]
     if angle:
         steps = np.where(np.abs(np.abs(steps) - TURN) < 0.5 * np.pi, steps - np.sign(steps) * TURN, steps)
     return steps
-
-
-def without_outliers(raw: RawEpisode, system: System, note: Note) -> RawEpisode:
-    """The episode with outliers marked as not usable: readings that jump away and back faster than the state can move.
-
-    Their rows keep time and command; their readings are interpolated.
-
-    Raises:
-        RecordingError: more than `MOST_OUTLIERS` of a column are outliers.
-    """
-    if len(raw.time) < FROZEN_ROWS:
-        return raw
-    bad = np.zeros(len(raw.time), bool)
-    period = float(np.median(np.diff(raw.time)))
-    for name, values in raw.states.items():
-        variable = _variable(system, name)
-        if variable.unit == "1":  # as a quaternion's, whose sign may change
-            continue
-        rate = system.rate_of(name)
-        allowed = variable.largest
-        if rate is not None:
-            allowed = min(allowed, 2 * period * _variable(system, rate).largest)
-        outliers = _outliers(differences(values, variable.unit == "rad"), values, allowed)
-        if outliers.mean() > MOST_OUTLIERS:
-            row = int(outliers.argmax())
-            raise RecordingError(
-                f"{raw.cell(row, name)} is {values[row]:g}, far off the rows before and after, and "
-                f"{outliers.mean():.0%} of the column lie as far off: a sensor that follows the motion is right"
-            )
-        for row in np.flatnonzero(outliers & ~bad).tolist():
-            note(
-                "lies far off the rows before and after: an outlier; the row's readings were set aside",
-                f"{raw.cell(row, name)}: {values[row]:g}",
-            )
-        bad |= outliers
-    if not bad.any():
-        return raw
-    # No outlier is first or last, since it jumps away and back.
-    rows, kept, state = np.flatnonzero(bad), np.flatnonzero(~bad), raw.state.copy()
-    later = np.searchsorted(kept, rows)
-    before, after = kept[later - 1], kept[later]
-    share = (rows - before) / (after - before)
-    for column, name in enumerate(raw.measured):
-        values = raw.state[:, column]
-        step = values[after] - values[before]
-        if _variable(system, name).unit == "rad":
-            step -= TURN * np.round(step / TURN)
-        state[rows, column] = values[before] + share * step
-    return replace(raw, state=state, usable=~bad)
-
-
-def _outliers(steps: NDArray[np.float64], values: NDArray[np.float64], allowed: float) -> NDArray[np.bool_]:
-    """Which rows (T,) follow a jump that is larger than `allowed` and than usual, and undone in `OUTLIER_ROWS` rows."""
-    apart = np.diff(np.unique(values))
-    usual = 1.4826 * float(np.median(np.abs(np.diff(steps)))) / 2
-    least = max(allowed, OUTLIER_SCALES * max(usual, float(apart.min()) if len(apart) else 0.0))
-    bad = np.zeros(len(values), bool)
-    for jump in np.flatnonzero(np.abs(steps) > least):
-        away = np.abs(np.cumsum(steps[jump : jump + OUTLIER_ROWS + 1]))
-        back = np.flatnonzero(away < OUTLIER_RETURN * away[0])
-        if len(back) and (away[: back[0]] > least).all():
-            bad[jump + 1 : jump + 1 + back[0]] = True
-    return bad
 
 
 def check_sensors(episodes: Sequence[RawEpisode], system: System, note: Note) -> list[RawEpisode]:

@@ -62,6 +62,10 @@ WHITE_SHARE = 0.03  # Share of the errors' variance that is taken as white, so t
 
 MIN_HELD = 0.01  # Least load that counts by which dry friction holds a joint, over that of the unexplained load
 
+HELD_ERROR = 0.05
+"""Deviation of the load that dry friction takes where a joint may be at rest, over the friction: the instant at which
+the joint comes free is known to a period."""
+
 MIN_WEIGHT = 1e-3  # of an instant at rest where the size of a moving joint's errors is fitted
 
 MIN_DISTINCT = 0.15  # Least share of a bump's information that columns and other bumps leave to it
@@ -262,8 +266,10 @@ class _Fit:
             deviations = (0.5 * _log_power(basis, power, moving)).exp().split(lengths)
             moments = torch.zeros(LAGS + 1, dtype=torch.float64)
             for part, (each, weight) in enumerate(zip(deviations, moving.split(lengths), strict=True)):
+                track = self.tracks[part]
+                held = HELD_ERROR * self._dry_friction(part)[:, j] * track.at_rest[:, j]
                 self.spread[part] = self.spread[part].clone()
-                self.spread[part][:, j] = each
+                self.spread[part][:, j] = torch.hypot(each, held)
                 white, more = weight * (residual[part] / each).clamp(-3, 3), weight * absorbed[part] / each
                 for lag in range(LAGS + 1):
                     end = len(each) - lag

@@ -1,0 +1,63 @@
+"""Readings of a stuck sensor are set aside; an episode is split where a position is suddenly elsewhere; what a machine
+does by itself is left alone."""
+
+import numpy as np
+import pytest
+
+from tests.recorded import a_run, load, write
+
+ROWS = 200
+
+
+@pytest.fixture(scope="module")
+def run():
+    return a_run(0.1, 1e-3, rows=ROWS, period=0.02)
+
+
+def with_x(run, x):
+    return {**run, "x": x}
+
+
+def moved(rows, amplitude=0.3):
+    """A cart that moves back and forth, with the noise of its sensor."""
+    time = 0.02 * np.arange(rows)
+    return amplitude * np.sin(4 * time) + 3e-4 * np.random.default_rng(1).normal(size=rows)
+
+
+def test_what_a_stuck_sensor_repeats_is_set_aside(file, run):
+    x = moved(ROWS)
+    true, x[61:75] = x.copy(), x[60]
+    recording = load(write(file, with_x(run, x)), columns={"x_dot": ""})
+    (episode,), (usable,) = recording.episodes, recording.usable
+    assert np.flatnonzero(~usable).tolist() == list(range(61, 75))
+    np.testing.assert_allclose(episode.state[usable, 0], true[usable])
+    np.testing.assert_allclose(np.diff(episode.state[60:76, 0]), (true[75] - true[60]) / 15)
+    (said,) = (one for one in recording.warnings if "stuck" in one)
+    assert said.startswith(f"{file}: row 62 (line 63), column 'x', and 13 rows after it: x repeats a reading")
+
+
+def test_a_cart_that_dry_friction_holds_has_no_stuck_sensor(file, run):
+    time = 0.02 * np.arange(ROWS)
+    stays = np.clip(time - 1.2, 0, None)
+    x = np.round(np.where(time < 0.9, 0.3 * np.sin(4 * time), 0.3 * np.sin(3.6)) - 0.4 * stays**2, 4)
+    recording = load(write(file, with_x(run, x)), columns={"x_dot": ""})
+    assert not recording.usable
+
+
+@pytest.mark.parametrize(("name", "size"), [("x", 0.03), ("theta", -0.05)])
+def test_an_episode_is_split_where_a_position_is_suddenly_elsewhere(file, run, name, size):
+    column = np.array(run[name])
+    column[120:] += size
+    recording = load(write(file, {**run, name: column}))
+    assert [len(episode.time) for episode in recording.episodes] == [120, ROWS - 120]
+    assert recording.episodes[1].time[0] == pytest.approx(2.4)
+    (said,) = (one for one in recording.warnings if "suddenly" in one)
+    row, by = said.split(", by ")
+    assert row.endswith(f"row 121 (line 122), column '{name}'")
+    assert float(by.split()[0]) == pytest.approx(size, abs=0.003)
+
+
+def test_a_hit_is_no_jump_of_the_sensor(file, run):
+    x = moved(ROWS, 0.02)
+    x[100:] += 0.02 * 5.0 * np.arange(100)  # at 5 m/s from one row to the next
+    assert len(load(write(file, with_x(run, x)), columns={"x_dot": ""}).episodes) == 1

@@ -1,0 +1,156 @@
+"""Single readings that are no measurements: outliers and what a stuck sensor repeats are set aside, and an episode is
+split where a position is suddenly elsewhere.
+
+Left in, they would look like a push to whoever differentiates the positions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from visadapt.recordings.clock import Note, RawEpisode
+from visadapt.recordings.episode import RecordingError
+from visadapt.recordings.runs import runs
+from visadapt.recordings.sensors import FROZEN_ROWS, TURN, differences
+from visadapt.systems import System, Variable
+
+OUTLIER_SCALES = 50.0
+"""Jump of a reading above which it may be an outlier, in usual departures from the mean of its neighbours."""
+OUTLIER_ROWS = 3
+"""Most consecutive rows that an outlier may last."""
+OUTLIER_RETURN = 0.2
+"""Share of a jump that may remain where the reading after an outlier counts as back at that before it."""
+MOST_OUTLIERS = 0.05
+"""Share of outliers among the rows of an episode above which the sensor is refused."""
+STUCK_ROWS = 5
+"""Equal readings of a position in a row, at least, that a stuck sensor repeats."""
+STUCK_RATIO, STUCK_STEPS = 3.0, 8
+"""Change of a position after its sensor stuck, over the next change and over the smallest of all, at least: a machine
+that dry friction held starts slowly instead."""
+JUMP_SCALES = 12.0
+"""Departure of a change from those around it, over the median departure, from which on a position may have jumped."""
+JUMP_RATIO, AROUND_JUMP = 2.0, 5
+"""The rate of that change over the fastest in so many rows on either side, at least: what is hit goes on moving."""
+DEVIATION_PER_MEDIAN = 1.4826
+"""Standard deviation over the median of the absolute values, of normal errors."""
+
+
+def without_outliers(raw: RawEpisode, system: System, note: Note) -> RawEpisode:
+    """The episode with outliers and the readings of stuck sensors marked as not usable.
+
+    Outliers jump away and back faster than the state can move. Such rows keep time and command; their readings are
+    interpolated.
+
+    Raises:
+        RecordingError: more than `MOST_OUTLIERS` of a column are outliers.
+    """
+    if len(raw.time) < FROZEN_ROWS:
+        return raw
+    bad = np.zeros(len(raw.time), bool)
+    for name, values in raw.states.items():
+        variable = _variable(system, name)
+        if variable.unit == "1":  # as a quaternion's, whose sign may change
+            continue
+        rate = system.rate_of(name)
+        allowed = variable.largest
+        if rate is not None:
+            allowed = min(allowed, 2 * float(np.median(np.diff(raw.time))) * _variable(system, rate).largest)
+        outliers = _outliers(differences(values, variable.unit == "rad"), values, allowed)
+        if outliers.mean() > MOST_OUTLIERS:
+            row = int(outliers.argmax())
+            raise RecordingError(
+                f"{raw.cell(row, name)} is {values[row]:g}, far off the rows before and after, and "
+                f"{outliers.mean():.0%} of the column lie as far off: a sensor that follows the motion is right"
+            )
+        for row in np.flatnonzero(outliers & ~bad).tolist():
+            note(
+                "lies far off the rows before and after: an outlier; the row's readings were set aside",
+                f"{raw.cell(row, name)}: {values[row]:g}",
+            )
+        bad |= outliers
+        # An angle that stands still in places is an effect of the catalogue.
+        if rate is not None and variable.unit != "rad":
+            for start, end in _stuck(raw, values):
+                note(
+                    f"{name} repeats a reading, then jumps: its sensor stuck; these rows' readings were set aside",
+                    f"{raw.cell(start, name)}, and {end - start - 1} rows after it",
+                )
+                bad[start:end] = True
+    return _interpolated(raw, bad, system) if bad.any() else raw
+
+
+def _outliers(steps: NDArray[np.float64], values: NDArray[np.float64], allowed: float) -> NDArray[np.bool_]:
+    """Which rows (T,) follow a jump that is larger than `allowed` and than usual, and undone in `OUTLIER_ROWS` rows."""
+    apart = np.diff(np.unique(values))
+    usual = DEVIATION_PER_MEDIAN * float(np.median(np.abs(np.diff(steps)))) / 2
+    least = max(allowed, OUTLIER_SCALES * max(usual, float(apart.min()) if len(apart) else 0.0))
+    bad = np.zeros(len(values), bool)
+    for jump in np.flatnonzero(np.abs(steps) > least):
+        away = np.abs(np.cumsum(steps[jump : jump + OUTLIER_ROWS + 1]))
+        back = np.flatnonzero(away < OUTLIER_RETURN * away[0])
+        if len(back) and (away[: back[0]] > least).all():
+            bad[jump + 1 : jump + 1 + back[0]] = True
+    return bad
+
+
+def _stuck(raw: RawEpisode, values: NDArray[np.float64]) -> Iterator[tuple[int, int]]:
+    """First row, and the row after the last, of each run in which a sensor of `values` (T,) repeats an earlier one."""
+    steps = np.abs(np.diff(values))
+    least = STUCK_STEPS * float(steps[steps > 0].min(initial=np.inf))
+    for start, end in runs(values):
+        lost = (raw.state[start:end] == raw.state[start]).all()  # whole rows, which are an effect of the catalogue
+        if end - start < STUCK_ROWS or end + 1 >= len(values) or lost:
+            continue
+        if steps[end - 1] > max(least, STUCK_RATIO * steps[end]):
+            yield start + 1, end
+
+
+def _interpolated(raw: RawEpisode, bad: NDArray[np.bool_], system: System) -> RawEpisode:
+    """The episode with the readings of `bad` rows (T,), neither the first nor the last, from those around."""
+    rows, kept, state = np.flatnonzero(bad), np.flatnonzero(~bad), raw.state.copy()
+    later = np.searchsorted(kept, rows)
+    before, after = kept[later - 1], kept[later]
+    share = (rows - before) / (after - before)
+    for column, name in enumerate(raw.measured):
+        values = raw.state[:, column]
+        step = values[after] - values[before]
+        if _variable(system, name).unit == "rad":
+            step -= TURN * np.round(step / TURN)
+        state[rows, column] = values[before] + share * step
+    return replace(raw, state=state, usable=~bad)
+
+
+def jumps(raw: RawEpisode, system: System, note: Note) -> list[int]:
+    """The rows from which on a position is suddenly elsewhere: its sensor lost count, or was moved."""
+    rows: set[int] = set()
+    lasting = np.diff(raw.time)
+    if len(lasting) < FROZEN_ROWS:
+        return []
+    for name, values in raw.states.items():
+        if system.rate_of(name) is None:
+            continue
+        steps = np.diff(values)
+        padded = np.pad(steps / lasting, AROUND_JUMP, mode="edge")
+        others = np.delete(np.lib.stride_tricks.sliding_window_view(padded, 2 * AROUND_JUMP + 1), AROUND_JUMP, 1)
+        nearest = others[:, AROUND_JUMP - 2 : AROUND_JUMP + 2].mean(1)
+        departs = steps - lasting * nearest
+        size = np.abs(departs)
+        usual = JUMP_SCALES * DEVIATION_PER_MEDIAN * float(np.median(size))
+        jump = size > np.maximum(usual, JUMP_RATIO * lasting * np.abs(others).max(1))
+        for row in (np.flatnonzero(jump[AROUND_JUMP:-AROUND_JUMP]) + AROUND_JUMP + 1).tolist():
+            note(
+                f"{name} is suddenly elsewhere and stays there: its sensor lost count, or was moved; the episode was "
+                "split",
+                f"{raw.cell(row, name)}, by {departs[row - 1]:.3g} {_variable(system, name).unit}",
+            )
+            rows.add(row)
+    return sorted(rows)
+
+
+def _variable(system: System, name: str) -> Variable:
+    """The state of this name."""
+    return system.states[system.index(name)]
