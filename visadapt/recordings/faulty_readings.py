@@ -141,6 +141,7 @@ def jumps(raw: RawEpisode, system: System, note: Note) -> list[int]:
         size = np.abs(departs)
         usual = JUMP_SCALES * DEVIATION_PER_MEDIAN * float(np.median(size))
         jump = size > np.maximum(usual, JUMP_RATIO * lasting * np.abs(others).max(1))
+        jump[1:] &= steps[:-1] != 0  # a sensor that stood still, which an effect of the catalogue does, then jumps
         for row in (np.flatnonzero(jump[AROUND_JUMP:-AROUND_JUMP]) + AROUND_JUMP + 1).tolist():
             note(
                 f"{name} is suddenly elsewhere and stays there: its sensor lost count, or was moved; the episode was "
