@@ -29,6 +29,11 @@ MAX_EFFECTS = 6  # Effects in a set at most
 MAX_CANDIDATES, MAX_EXCHANGES = 8, 3
 """Most effects that are tried with a set: when sets grow, and in the place of those that are exchanged."""
 
+TIED, MAX_TIED = 1.0, 8
+"""Log likelihood by which the screening of effects may differ that are tied with the first, and how many of these are
+tried at most: where one of them is fitted, all are. Of a shaft that turns one way, dry friction, a bias of the motor
+and a constant load do the same."""
+
 TWO_FOR_ONE_UP_TO = 4
 """Effects at most in a set of which two are exchanged for one. Larger sets describe something that no effect explains;
 their many pairs would take most of the search."""
@@ -143,9 +148,10 @@ class Search(FittedModels):
         values = {one.effect: one.values for one in leads}
         order = [*values, *(e for e in self.catalogue if e not in values)]
         starts = [((e,), with_effect(self.source.fits, values.get(e, neutral(e)))) for e in order]
-        alone = self.fit(starts[:LEADERS], QUICK)
+        first = len(_leading(leads, LEADERS))
+        alone = self.fit(starts[:first], QUICK)
         if not self.explains_all(max(alone, key=lambda each: each.log_odds)):
-            alone += self.fit(starts[LEADERS:], QUICK)
+            alone += self.fit(starts[first:], QUICK)
             # Process noise may stand for most of what a large effect does, at a value far from the right one: a delay
             # of 80 ms was fitted as one of 45, in steps of 50, and five more effects for the rest.
             best = sorted(alone, key=lambda each: -each.log_odds)[:LEADERS]
@@ -289,7 +295,7 @@ class Search(FittedModels):
                 slow.append((kept, fits))
             rest = [e for e in self.catalogue if e not in centre.effects]
             screened = screen(self.system, kept, fits, self.rows, rest, self.jobs)
-            for candidate in self._promising(screened)[:MAX_EXCHANGES]:
+            for candidate in _leading(self._promising(screened), MAX_EXCHANGES):
                 process, noise = centre.fits.log_process.clamp(min=EXCHANGE_LOG_PROCESS), centre.fits.log_noise
                 start = replace(with_effect(fits, candidate.values), log_process=process, log_noise=noise)
                 exchanges.append(((*kept, candidate.effect), start))
@@ -325,6 +331,12 @@ class Search(FittedModels):
         close = close[:POLISH_MODELS]
         smaller = [self.fitted.get(frozenset(best.names) - {name}) for name in best.names]
         return close + [f for f in smaller if f is not None and all(f is not other for other in close)]
+
+
+def _leading(screened: Sequence[Candidate], count: int) -> Sequence[Candidate]:
+    """The first `count` candidates of a screening, and those tied with the first one."""
+    tied = sum(one.gain > screened[0].gain - TIED for one in screened)
+    return screened[: max(count, min(tied, MAX_TIED))]
 
 
 def _imitates(one: ScoredModel, other: ScoredModel) -> bool:
