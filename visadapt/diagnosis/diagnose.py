@@ -14,6 +14,7 @@ from visadapt.diagnosis.answer import Answer, answer
 from visadapt.diagnosis.exploration import Explored
 from visadapt.diagnosis.figures_data import disturbances, figure_data, film_frames
 from visadapt.diagnosis.frames import UNSEEN, Film, FramesError, watch, with_camera
+from visadapt.diagnosis.next_experiment import OF_ONE_MACHINE
 from visadapt.diagnosis.result import (
     NO_GAP,
     UNEXPLAINED,
@@ -39,6 +40,7 @@ from visadapt.diagnosis.verdict import (
     late_by_less_than,
     left_unexplained,
     next_step,
+    one_by_one,
     shown_by_episodes,
 )
 from visadapt.diagnosis.words import A_ROW_LATE, BESIDE_PUSHES, listed, printable
@@ -141,7 +143,9 @@ def diagnose(
         causes=found,
         ranking=ranking(comparison, explored.effects, system, measured.closed, [one for one, _ in explored.repeats]),
         gap=gap,
-        next_experiment=next_step(
+        next_experiment=OF_ONE_MACHINE
+        if verdict == UNEXPLAINED and explored.apart
+        else next_step(
             search,
             comparison,
             verdict,
@@ -221,6 +225,8 @@ def _warnings(answered: Answer, origin: str) -> Iterator[str]:
         yield f"pushes in single episodes were not looked for: they need {listed(unread)}, which no sensor read"
     if not measured.errors.held_out:
         yield f"{origin}: {TOO_SHORT}"
+    if verdict == UNEXPLAINED and explored.apart:
+        yield one_by_one(explored.apart)
     unexplained = comparison.unexplained(measured.improvable)
     yield from left_unexplained(comparison, verdict, unexplained)
     yield from at_bounds(comparison, found, explored.effects)

@@ -8,8 +8,10 @@ from dataclasses import dataclass, replace
 from visadapt.diagnosis.result import Cause, Push
 from visadapt.diagnosis.search import duration
 from visadapt.diagnosis.search.all_rows import best_on_all_rows, on_all_rows
+from visadapt.diagnosis.search.apart import ExplainedAlone, explained_apart
 from visadapt.diagnosis.search.causes import Alternative, alternatives
 from visadapt.diagnosis.search.coloured import colour_left_by, with_coloured_noise
+from visadapt.diagnosis.search.fitted_models import MIN_LEFTOVER
 from visadapt.diagnosis.search.jumps import with_jumps
 from visadapt.diagnosis.search.model_comparison import ModelComparison, compare
 from visadapt.diagnosis.search.preparation import PreparedRecording, prepare
@@ -32,6 +34,7 @@ class Explored:
     comparison: ModelComparison
     groups: list[list[Alternative]]  # the effects of the best set, each with those that fit as well in its place
     repeats: list[tuple[Cause, float]]  # causes of repeated readings, and the log likelihood lost without them
+    apart: tuple[ExplainedAlone, ...]  # recordings that are explained one by one, and not together
 
 
 def explore(
@@ -54,7 +57,7 @@ def explore(
     candidates = searched(effects, system)
     prepared = prepare(recording, system, candidates, pushes)
     rows = prepared.rows
-    search = Search(system, rows.select(prepared.searched), candidates, prepared.source, jobs)
+    searched_in = search = Search(system, rows.select(prepared.searched), candidates, prepared.source, jobs)
     if announce is not None:
         announce(duration.announcement(rows, len(effects), duration.expected(search, rows), jobs))
     jumping = with_jumps(search)
@@ -68,9 +71,13 @@ def explore(
         search = on_all_rows(search, rows)
     comparison = compare(search)
     repeats = repeated_reading_causes(prepared, search, comparison, repeating)
-    again = staged(progress, "search with coloured noise")
-    search, comparison = with_coloured_noise(search, comparison, prepared.searched, again)
+    apart: tuple[ExplainedAlone, ...] = ()
+    if comparison.leftover > MIN_LEFTOVER and not comparison.negligible and jumping is None:
+        apart = explained_apart(searched_in, recording.sources, progress)
+    if not apart:
+        again = staged(progress, "search with coloured noise")
+        search, comparison = with_coloured_noise(search, comparison, prepared.searched, again)
     # Periodic effects may have got a phase for each episode.
     in_use = {effect.name: effect for effect in search.catalogue}
     named = [in_use.get(effect.name, effect) for effect in effects]
-    return Explored(named, prepared, search, comparison, alternatives(comparison, named, system), repeats)
+    return Explored(named, prepared, search, comparison, alternatives(comparison, named, system), repeats, apart)

@@ -37,6 +37,12 @@ ALONG = (
 """For a film of a track without features."""
 
 
+OF_ONE_MACHINE = (
+    "The machine, or a sensor, was changed between the recordings: diagnose each by itself, or record all of them with "
+    "one machine that is left as it is."
+)
+"""For recordings that are explained one by one, and not together."""
+
 MIN_LOG_ODDS = 0.0  # Log odds above which the variable of an unexplained disturbance is named: likelier than not
 
 SURE_LOG_ODDS = 4.0  # Log odds above which the disturbance is said to depend on it

@@ -7,13 +7,15 @@ from collections.abc import Collection, Sequence
 
 from visadapt.diagnosis import next_experiment
 from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, NO_GAP, UNEXPLAINED, Cause, Gap, without_slight
+from visadapt.diagnosis.search.apart import ExplainedAlone
 from visadapt.diagnosis.search.causes import Alternative, is_at_end
+from visadapt.diagnosis.search.fitted_models import ScoredModel
 from visadapt.diagnosis.search.heldout import MIN_GAP
 from visadapt.diagnosis.search.model_comparison import ModelComparison
 from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.search.sensor_checks import CoarseSteps
 from visadapt.diagnosis.search.unexplained import SmoothFunction, smooth_functions
-from visadapt.diagnosis.words import listed, number, with_unit
+from visadapt.diagnosis.words import ONE_BY_ONE, listed, number, plain, with_unit
 from visadapt.effects import EFFECTS, Effect, Parameter, QuadraticDrag, RotorDrag
 from visadapt.effects.aerial import AirDrag
 from visadapt.estimation.candidate import CandidateModel
@@ -110,6 +112,22 @@ def next_step(
     carrying = {cause.effect for cause in without_slight(found)}
     classes = [[one.effect for one in group] for group in groups]
     return next_experiment.separate([c for c in classes if carrying & {one.name for one in c}], search.system)
+
+
+def one_by_one(apart: Sequence[ExplainedAlone]) -> str:
+    """The warning of recordings that are explained one by one, and not together."""
+    each = (f"{one.source} by {_with_values(one.best) or 'the unchanged simulator'}" for one in apart)
+    return f"{ONE_BY_ONE}: {'; '.join(each)}"
+
+
+def _with_values(found: ScoredModel) -> str:
+    """The effects of a set, each with its values."""
+    parts = []
+    for effect, values in found.by_effect(found.fits.theta[0]).items():
+        named = zip(effect.table, values.tolist(), strict=True)
+        each = (f"{one.name} {with_unit(number(value, 4), one.unit)}" for one, value in named)
+        parts.append(f"{plain(effect.name)} ({', '.join(each)})")
+    return listed(parts)
 
 
 def left_by_source(search: Search) -> list[SmoothFunction]:

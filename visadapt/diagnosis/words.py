@@ -15,6 +15,9 @@ BESIDE_PUSHES = (
 )
 """The warning of a diagnosis for which pushes were set aside."""
 
+ONE_BY_ONE = "each recording is explained by itself, but not all together"
+"""What the warning begins with of recordings between which the machine was changed."""
+
 A_ROW_LATE = "the commands were moved a row up"
 """What it warns of where each command was recorded a row late."""
 

@@ -25,6 +25,7 @@ from visadapt.diagnosis.result import (
 from visadapt.diagnosis.words import (
     BESIDE_PUSHES,
     MISFIT,
+    ONE_BY_ONE,
     chance,
     closed,
     estimate,
@@ -163,6 +164,8 @@ def _unexplained(diagnosis: Diagnosis) -> str:
             "Something passes that no known effect explains: a push, a gust, or an effect that acts now and then. "
             f"Beside it there is no gap (error {number(gap.before)}, noise {number(gap.floor)})."
         )
+    if any(warning.startswith(ONE_BY_ONE) for warning in diagnosis.warnings):
+        return f"{_capitalised(ONE_BY_ONE)}: the machine, or a sensor, was changed between them (see the warning)."
     if math.isnan(gap.closed):
         return (
             "The simulator predicts as well as the fitted noise allows, but a gap hides, or may hide, in that noise: "

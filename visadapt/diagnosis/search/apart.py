@@ -1,0 +1,48 @@
+"""Recordings that are explained one by one, but not together: the machine was changed between them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+
+from visadapt.diagnosis.search.fitted_models import ScoredModel
+from visadapt.diagnosis.search.search import Search
+from visadapt.progress import Report, staged
+
+MOST_RECORDINGS = 8  # that are explained one by one
+
+MIN_LOG_ODDS = 10.0  # By which they must be likelier so than together: each then pays for effects of its own
+
+
+@dataclass(frozen=True)
+class ExplainedAlone:
+    """One recording of several, and the set of effects that explains it by itself."""
+
+    source: str  # its file
+    best: ScoredModel
+
+
+def explained_apart(
+    search: Search, sources: Sequence[str], progress: Report | None = None
+) -> tuple[ExplainedAlone, ...]:
+    """What explains each recording by itself, where that is everything and is likelier than the best set of a search in
+    all of them together; else nothing.
+
+    `sources` are the recordings that the episodes are of. The first recording that is not explained by itself ends the attempt.
+    """
+    files = [sources[episode] for episode in search.rows.episode.tolist()]
+    names = list(dict.fromkeys(files))
+    if not 1 < len(names) <= MOST_RECORDINGS:
+        return ()
+    out = []
+    for name in names:
+        windows = torch.tensor([window for window, file in enumerate(files) if file == name])
+        alone = Search(search.system, search.rows.select(windows), search.catalogue, jobs=search.jobs)
+        alone.run(staged(progress, f"search in {name} alone"))
+        if not alone.explains_all(alone.best):
+            return ()
+        out.append(ExplainedAlone(name, alone.best))
+    likelier = sum(one.best.log_odds for one in out) - search.best.log_odds
+    return tuple(out) if likelier > MIN_LOG_ODDS else ()
