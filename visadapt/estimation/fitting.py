@@ -22,8 +22,8 @@ from visadapt.estimation.likelihood import (
 MIN_ITERATION_GAIN = 0.05  # Log likelihood; a fit stops after two iterations in a row that gain, or lose, less
 
 LEAST_NOISE = 2e-5
-"""Least standard deviation of a measurement, as a share of the largest size in its state's range: below it, as in
-simulated recordings without noise, errors of the integration would be taken for physics."""
+"""Least standard deviation of a measurement, as a share of its state's scale: below it, as in simulated recordings
+without noise, errors of the integration would be taken for physics."""
 
 FIRST_DAMPING = 1e-3  # Damping of the first step, as a share of the information
 
@@ -152,7 +152,7 @@ def _step(
     noise_change = log_change @ noise_members(model)[1]
     # Rounding to a resolution is noise with a deviation of resolution / sqrt(12).
     resolution = torch.tensor(model.rows.resolution, dtype=torch.float64)
-    least = torch.tensor([LEAST_NOISE * model.system.states[k].largest for k in model.rows.channels]).double()
+    least = torch.tensor([LEAST_NOISE * model.system.states[k].scale for k in model.rows.channels]).double()
     lowest_process = min_log_process(model.rows.period)
     lowest_noise = (resolution.square() / 12 + least.square()).log()
     return replace(

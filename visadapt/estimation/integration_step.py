@@ -14,8 +14,8 @@ from visadapt.systems.integrators import steps_within
 from visadapt.world import World
 
 LARGEST_ERROR = 1e-5
-"""Root mean square error of integration over a row, as a share of the largest size in the state's range: of an angle of
-half a turn, a fifteenth of the error of an encoder of 4,096 counts."""
+"""Root mean square error of integration over a row, as a share of the state's scale: of half a turn, a fifteenth of the
+error of an encoder of 4,096 counts."""
 
 MOST_SUBSTEPS = 32  # In a row
 
@@ -32,7 +32,7 @@ def with_longest_step(rows: Segments, system: System) -> Segments:
     used = (rows.inside[:, 1:] > 0).flatten()
     start = state.flatten(0, 1)[used]
     command, (time, duration) = rows.given[:, :-1].flatten(0, 1)[used], (each[used] for each in rows.clock)
-    largest = torch.tensor([variable.largest for variable in system.states], dtype=torch.float64)
+    scale = torch.tensor([variable.scale for variable in system.states], dtype=torch.float64)
 
     def ahead(substeps: int) -> torch.Tensor:
         world = World(system, (), rows.period, "rk4", substeps)
@@ -43,7 +43,7 @@ def with_longest_step(rows: Segments, system: System) -> Segments:
         coarse = ahead(count)
         while count < MOST_SUBSTEPS:
             fine = ahead(2 * count)
-            error = ((fine - coarse) / largest).square().mean(0).sqrt()
+            error = ((fine - coarse) / scale).square().mean(0).sqrt()
             if not bool(error.isfinite().all()) or float(error.max()) < LARGEST_ERROR:
                 break
             count, coarse = 2 * count, fine

@@ -36,7 +36,7 @@ def with_unmeasured(rows: Segments, system: System) -> Segments:
     columns = unmeasured(rows, system)
     if not columns:
         return rows
-    least = torch.tensor([LEAST_NOISE * system.states[k].largest for k in rows.channels], dtype=torch.float64)
+    least = torch.tensor([LEAST_NOISE * system.states[k].scale for k in rows.channels], dtype=torch.float64)
     noise = torch.maximum(READING_NOISE * noise_of_readings(rows), least.square())
     parts = [rows.select(windows) for windows in torch.arange(rows.shape[0]).split(WINDOWS_AT_ONCE)]
     estimated = torch.cat([_estimated(part, system, columns, noise) for part in parts])

@@ -32,6 +32,12 @@ class Variable:
         """The largest size in its range."""
         return max(abs(self.low), abs(self.high))
 
+    @property
+    def scale(self) -> float:
+        """The size against which errors are small or not: the largest, but half a turn at most of a shaft that turns
+        on."""
+        return min(self.largest, math.pi) if self.unit == "rad" else self.largest
+
 
 class System(ABC):
     """Physics of the source simulator in continuous time, batched and differentiable.

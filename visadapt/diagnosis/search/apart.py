@@ -30,7 +30,7 @@ def explained_apart(
     """What explains each recording by itself, where that is everything and is likelier than the best set of a search in
     all of them together; else nothing.
 
-    `sources` are the recordings that the episodes are of. The first recording that is not explained by itself ends the attempt.
+    `sources` are the recordings that the episodes are of. The first that is not explained by itself ends the attempt.
     """
     files = [sources[episode] for episode in search.rows.episode.tolist()]
     names = list(dict.fromkeys(files))
