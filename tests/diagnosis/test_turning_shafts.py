@@ -133,3 +133,23 @@ def test_an_eccentric_encoder_is_named():
     assert cause.effect == "disc.sensor_eccentricity"
     for name, truth in {"amplitude": 0.012, "waves": 1.0, "phase": 0.5}.items():
         assert cause.parameters[name].value == pytest.approx(truth, rel=0.02)
+
+
+def test_of_a_shaft_that_turns_one_way_all_that_does_the_same_is_named():
+    world, time = va.World(Drive(), (), PERIOD).double(), PERIOD * np.arange(ROWS)
+    friction = next(one for one in catalogue(Drive()) if one.name == "motor_axis.coulomb_friction")(torque=0.01)
+    torque = 0.12 + 0.05 * np.sin(4 * time) + 0.03 * np.sin(13 * time)
+    at, states = world.with_effects([friction]).double().start(torch.tensor([[0.0, 0.0, 12.0, 12.0]]).double()), []
+    for command in torque:
+        states.append(at.state[0].numpy())
+        at = world.with_effects([friction]).double().step(at, torch.tensor([[command]]))
+    read = np.stack(states) + np.random.default_rng(0).normal(size=(ROWS, 4)) * [1e-3, 1e-3, 0.05, 0.05]
+    recording = Recording(
+        (Episode(time, torque[:, None], read),), tuple(s.name for s in Drive.states), PERIOD, ("run",)
+    )
+    with torch.inference_mode():
+        found = va.diagnose(recording, va.World(Drive(), (), PERIOD))
+    same = {"coulomb_friction", "constant_load", "actuator_bias", "actuator_deadzone"}
+    assert found.verdict == "ambiguous"
+    assert {cause.effect.partition(".")[2] for cause in found.causes if not cause.slight} == same
+    assert found.recording.noise["motor"].value == pytest.approx(1e-3, rel=0.2)

@@ -226,6 +226,10 @@ class ActuatorLag(ActuationEffect):
     equation = "time_constant du/dt = command - u, u(0) = 0"
     source = "Franklin, Powell and Emami-Naeini (2015), Feedback Control of Dynamic Systems, section 3.1"
     table = (Parameter("time_constant", "s", 0.0, 0.3, 0.0),)
+    caveat = (
+        "sensors that all lag alike, as thermocouples do, give nearly the same recording; a step of the command from "
+        "rest, with its current or force measured, tells which lags"
+    )
 
     def memory(self, commands: Tensor, substep: float) -> Tensor:
         return torch.zeros_like(commands[:, :1])

@@ -39,7 +39,8 @@ class Loads:
 
 
 def columns_of(motion: Motion, known: SmoothFunction | None) -> Loads:
-    """The loads that a motion takes beyond the world's; `known` is a function of states that acts as a load."""
+    """The loads that a motion takes beyond the world's; `known` is a function, of states or of a command, that acts
+    as a load."""
     response, columns = _of_commands(motion)
     driven = (response * motion.commanded[:, None]).sum(-1)
     sliding = motion.without_dry_friction()
@@ -112,10 +113,17 @@ def _of_parameters(motion: Motion) -> Iterator[Column]:
 
 
 def _of_function(motion: Motion, known: SmoothFunction | None) -> Iterator[Column]:
-    """Of each bump, or wave, of a function of states that acts as a load."""
-    if known is not None and known.loads is not None and known.states is not None:
-        for each in known.basis(motion.state @ known.states).unbind(-1):
-            yield each[:, None] * known.loads, None
+    """Of each bump, or wave, of a function of states, or of a command, that acts as a load."""
+    if known is None or known.loads is None:
+        return
+    if known.states is not None:
+        values = motion.state @ known.states
+    elif known.command is not None:
+        values = motion.commanded[:, known.command]
+    else:
+        return
+    for each in known.basis(values).unbind(-1):
+        yield each[:, None] * known.loads, None
 
 
 def _on(motion: Motion, joint: int) -> Tensor:

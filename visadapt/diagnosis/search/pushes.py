@@ -78,10 +78,10 @@ def pushes(
 ) -> tuple[Push, ...]:
     """The pushes in a recording beyond what a world, or one for each episode, explains; in the order of time.
 
-    Of the loads that are `unexplained`, the most probable first, the first that is a clear function of states is no
-    push.
+    Of the loads that are `unexplained`, the most probable first, the first that is a clear function of states, or of a
+    command, is no push.
     """
-    functions = (one for one in unexplained if one.states is not None and one.log_odds > CLEAR_LOG_ODDS)
+    functions = (one for one in unexplained if one.is_of_motion and one.log_odds > CLEAR_LOG_ODDS)
     worlds = [world] * len(recording.episodes) if isinstance(world, World) else world
     try:
         tracks = load_tracks(recording, worlds, next(functions, None))

@@ -50,7 +50,14 @@ class SmoothFunction:
     """(L,) its share of each load: 1 for one load, 1 and -1 for opposite ones; None: an error of a reading"""
     states: Tensor | None = field(default=None, compare=False)
     """(n,) weights of the states whose sum is the variable; None: it is no state, or the function has a factor"""
+    command: int | None = field(default=None, compare=False)
+    """the command that is the variable; None: it is none, or the function has a factor"""
     centres: Tensor | None = field(default=None, compare=False)  # (BUMPS,) of its bumps; None: waves within a turn
+
+    @property
+    def is_of_motion(self) -> bool:
+        """Whether states, or a command, give its variable: not time, nor a function with a factor."""
+        return self.states is not None or self.command is not None
 
     @property
     def terms(self) -> int:
@@ -92,6 +99,7 @@ def _loads(model: CandidateModel, along: Tensor) -> Iterator[tuple[SmoothFunctio
     """Functions that act as loads, each with its share (L,) of each load, and its bumps or waves (W, T, M)."""
     system, inside = model.system, model.rows.inside > 0
     column = {state.name: k for k, state in enumerate(system.states)}
+    commands = {action.name: k for k, action in enumerate(system.actions)}
     variables = variables_of(model, along)
     for name, values in variables.items():
         centres = _centres(values[inside])
@@ -99,7 +107,8 @@ def _loads(model: CandidateModel, along: Tensor) -> Iterator[tuple[SmoothFunctio
             on = _unit(len(system.loads), k)
             for factor in model.profile.smooth_function_factors.get(load.name, (None,)):
                 of = _unit(len(system.states), column[name]) if name in column and factor is None else None
-                function = SmoothFunction(load.name, False, name, loads=on, states=of, centres=centres)
+                by = commands.get(name) if factor is None else None
+                function = SmoothFunction(load.name, False, name, loads=on, states=of, command=by, centres=centres)
                 yield function, on, function.basis(values) * (1.0 if factor is None else variables[factor][..., None])
     for port, name, on, of in _of_turns(system, along[inside]):
         function = SmoothFunction(port, False, name, loads=on, states=of)
