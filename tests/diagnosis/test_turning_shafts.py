@@ -136,19 +136,19 @@ def test_an_eccentric_encoder_is_named():
 
 
 def test_of_a_shaft_that_turns_one_way_all_that_does_the_same_is_named():
-    world, time = va.World(Drive(), (), PERIOD).double(), PERIOD * np.arange(ROWS)
-    friction = next(one for one in catalogue(Drive()) if one.name == "motor_axis.coulomb_friction")(torque=0.01)
-    torque = 0.12 + 0.05 * np.sin(4 * time) + 0.03 * np.sin(13 * time)
-    at, states = world.with_effects([friction]).double().start(torch.tensor([[0.0, 0.0, 12.0, 12.0]]).double()), []
-    for command in torque:
-        states.append(at.state[0].numpy())
-        at = world.with_effects([friction]).double().step(at, torch.tensor([[command]]))
+    friction = next(one for one in catalogue(Drive()) if one.name == "motor_shaft.coulomb_friction")(torque=0.01)
+    world, time = va.World(Drive(), [friction], PERIOD).double(), PERIOD * np.arange(ROWS)
+    torque = 0.03 + 0.01 * np.sin(4 * time) + 0.01 * np.sin(13 * time)
+    at, states = world.start(torch.tensor([[0.0, 0.0, 12.0, 12.0]]).double()), []
+    with torch.no_grad():
+        for command in torque:
+            states.append(at.state[0].numpy())
+            at = world.step(at, torch.tensor([[command]]))
     read = np.stack(states) + np.random.default_rng(0).normal(size=(ROWS, 4)) * [1e-3, 1e-3, 0.05, 0.05]
-    recording = Recording(
-        (Episode(time, torque[:, None], read),), tuple(s.name for s in Drive.states), PERIOD, ("run",)
-    )
-    with torch.inference_mode():
-        found = va.diagnose(recording, va.World(Drive(), (), PERIOD))
+    assert read[:, 2].min() > 2.0
+    names = tuple(state.name for state in Drive.states)
+    recording = Recording((Episode(time, torque[:, None], read),), names, PERIOD, ("run",))
+    found = va.diagnose(recording, va.World(Drive(), (), PERIOD))
     same = {"coulomb_friction", "constant_load", "actuator_bias", "actuator_deadzone"}
     assert found.verdict == "ambiguous"
     assert {cause.effect.partition(".")[2] for cause in found.causes if not cause.slight} == same

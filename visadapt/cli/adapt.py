@@ -59,6 +59,12 @@ def run(options: argparse.Namespace) -> None:
         print(_in_words(last))
         for warning in last.warnings:
             print(f"Warning    {warning}")
+    if adapted.taken_back:
+        print(
+            f"The policy is the one that it began as, since the tuned one was worse: {adapted.taken_back}. A residual "
+            "on the last state alone cannot learn a motor that is late: --diagnose names it, and with --with-history "
+            "earlier periods are seen"
+        )
     print(f"{adapted.ledger.used} samples of {target.name} used; the policy is {folder / 'policy.safetensors'}")
 
 

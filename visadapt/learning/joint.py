@@ -39,6 +39,9 @@ class Adapted:
     """where the run is kept; None: it is not"""
     source: World
     """the source, with the effects that were fitted, and those that the last diagnosis named"""
+    taken_back: str = ""
+    """why the policy has the weights again that it began with: the machine showed that the tuned ones do much worse;
+    empty where it has the tuned ones"""
 
     def restore(self, policy: Policy, samples: int) -> None:
         """Give `policy`, and the residual it reads, the weights they had after `samples` counted samples.
@@ -76,4 +79,5 @@ def adapt(learning: JointLearning, folder: Path, round_samples: int, seed: int) 
         )
     count = math.ceil(budget / round_samples)
     rounds = [learning.round(RoundFolder.of(folder, number, count, seed), round_samples) for number in range(count)]
-    return Adapted(learning.policy, learning.ledger, rounds, learning.episodes, folder, learning.known)
+    taken_back = learning.take_back()
+    return Adapted(learning.policy, learning.ledger, rounds, learning.episodes, folder, learning.known, taken_back)

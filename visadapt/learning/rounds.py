@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ from visadapt.learning.explanation import NOT_DIAGNOSED, Explain, Explanation
 from visadapt.learning.feedforward import initialise_feedforward
 from visadapt.learning.grounding import GroundLoss, fit_named, ground, rescale
 from visadapt.learning.ledger import Ledger
+from visadapt.learning.setback import Performance, setback
 from visadapt.learning.setup_settings import SetupSettings
 from visadapt.learning.stability import early_cost, improved, plan_costs, stable
 from visadapt.learning.transitions import Observe, Transitions
@@ -138,6 +140,8 @@ class JointLearning:
             with suppress(CheckpointError):  # one of another architecture is dropped
                 load_weights(self.residual, self.policy.residual.state_dict(), Path("the policy's residual"))
         self.policy.residual = self.residual
+        self._began_with = copy.deepcopy(self.policy.state_dict())
+        self._collected: list[int] = []  # episodes of each round
 
     @property
     def known(self) -> World:
@@ -185,9 +189,24 @@ class JointLearning:
             episodes = collect(collector, self.target, wanted, longest, folder.generator(COLLECTING), added)
             write_recording(folder.recording, episodes)
         self.recordings.append(folder.recording)
-        for episode in read_recording(folder.recording):
+        collected = read_recording(folder.recording)
+        for episode in collected:
             self.ledger.count(f"{folder.name}: data", episode.samples)
-            self.waiting.append(episode)
+        self.waiting += collected
+        self._collected.append(len(collected))
+
+    def take_back(self) -> str:
+        """Give the policy what it began with, if it did much worse in later rounds' data than in the first's; why, or
+        nothing."""
+        if self.explorer is not None:
+            return ""
+        episodes, longest, task = iter(self.episodes), self.settings.longest_episode, self.settings.tuning.task
+        rounds = [list(islice(episodes, count)) for count in self._collected]
+        why = setback([Performance.of(each, longest, task) for each in rounds])
+        if why:
+            self.policy.load_state_dict(self._began_with)
+            self.found = NOT_DIAGNOSED
+        return why
 
     def _transitions(self) -> Transitions:
         """Transitions of all episodes so far, for which the waiting ones are labelled first.

@@ -188,9 +188,10 @@ def uninterrupted(raw: RawEpisode, note: Note, jumps: Sequence[int] = ()) -> lis
         note("rows are missing here; the episode was split", f"{raw.origin}, {raw.place(cut)}")
     edges = sorted({0, *cuts, *jumps, len(raw.time)})
     parts = [_clocked(raw.part(start, end)) for start, end in pairwise(edges)]
-    unsteady = np.concatenate([steps for part in parts if _is_unsteady(steps := np.diff(part.time), period)] or [[]])
-    if len(unsteady):
-        note(f"an unsteady clock: its steps last {unsteady.min():.3g} to {unsteady.max():.3g} s", raw.origin)
+    unsteady = [own for part in parts if _is_unsteady(own := np.diff(part.time), period)]
+    if unsteady:
+        shortest, longest = min(own.min() for own in unsteady), max(own.max() for own in unsteady)
+        note(f"an unsteady clock: its steps last {shortest:.3g} to {longest:.3g} s", raw.origin)
     return parts
 
 

@@ -197,7 +197,8 @@ def adapt(
 
     Returns:
         The tuned policy; with a target, the run: its `policy`, `ledger`, `rounds` and `episodes`, and the `source` with
-        the effects that were found.
+        the effects that were found. Where the rounds show that tuned policies do much worse on the target than the one
+        given, `policy` has the weights of that one, and `taken_back` says why.
 
     Raises:
         ValueError: a policy of another system, a target of another period or with other actions, effects that cannot

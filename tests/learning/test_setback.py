@@ -1,0 +1,65 @@
+"""A tuned policy that does much worse on the machine than the one it began as is not kept."""
+
+import math
+
+import numpy as np
+import pytest
+
+import visadapt as va
+from visadapt.effects import ActuatorDelay
+from visadapt.learning.setback import Performance, setback
+from visadapt.recordings import Episode
+from visadapt.tasks.balance import PAPER_CARTPOLE, Balance
+
+WELL = Performance(40, 0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("later", "why"),
+    [
+        ([], ""),
+        ([WELL] * 4, ""),
+        # One episode a round: its cost depends on where it started.
+        ([Performance(40, 0, cost) for cost in (0.5, 7.0, 2.0, 0.8)], ""),
+        ([Performance(40, 0, 7.0)], ""),
+        ([Performance(40, 2, math.nan)], ""),
+        ([WELL, WELL, Performance(40, 5, math.nan)], "5 of its episodes on the machine ended early, in 40 steps"),
+        ([Performance(40, 0, 30.0)], "on the machine it cost 30 times"),
+        ([Performance(40, 0, cost) for cost in (8.0, 5.0, 6.0, 0.5)], "on the machine it cost 5.5 times"),
+    ],
+)
+def test_what_counts_as_much_worse(later, why):
+    found = setback([WELL, *later])
+    assert found.startswith(why)
+    assert bool(found) == bool(why)
+
+
+def test_a_policy_that_failed_before_cannot_do_much_worse():
+    assert setback([Performance(40, 9, math.nan), Performance(40, 10, math.nan)]) == ""
+
+
+def test_episodes_that_end_early_and_the_cost_of_the_others():
+    def still(rows, speed):
+        state = np.tile([0.0, speed, 0.0, 0.0], (rows, 1))
+        return Episode(0.05 * np.arange(rows), np.zeros((rows, 1)), state)
+
+    task = Balance(PAPER_CARTPOLE)
+    # Of 30 steps, in episodes of 20 at most, the last is as long as it could be.
+    found = Performance.of([still(13, 1.0), still(14, 1.0), still(6, 1.0)], 20, task)
+    assert (found.steps, found.failures) == (30, 2)
+    faster = Performance.of([still(13, 2.0), still(14, 2.0), still(6, 2.0)], 20, task)
+    assert faster.cost > found.cost > 0
+    assert math.isnan(Performance.of([still(6, 1.0)], 20, task).cost)
+
+
+def test_under_a_late_motor_the_policy_stays_what_it_was(tmp_path):
+    policy, motor = va.load_policy(va.shipped("cartpole_states")), ActuatorDelay(delay=0.05)
+    target = va.SyntheticTarget(lambda batch, generator: [motor])
+    source = va.World(va.CartPole())
+    result = va.adapt(policy, source, target, 120, tmp_path / "run", round_samples=30, iterations=100)
+    assert "of its episodes on the machine ended early" in result.taken_back
+    steps = 60
+    scores = [va.score(one, target, episodes=4, steps=steps) for one in (policy, result.policy)]
+    assert scores[0] == scores[1]
+    result.restore(result.policy, 120)  # the tuned one is still there
+    assert va.score(result.policy, target, episodes=4, steps=steps).mean_length < steps / 3
