@@ -2,9 +2,17 @@ import json
 
 import pytest
 
-from visadapt.storage.run_folder import RunError, once, open_run, read_json, write_json
+from visadapt.storage.run_folder import RunError, alone_in, once, open_run, read_json, write_json
 
 SETTINGS = {"seed": 0, "spread": (0.1, 0.2), "out": None, "budget": 1000}
+
+
+def test_a_folder_in_which_a_run_works_is_closed_to_others_until_it_ends(tmp_path):
+    folder = tmp_path / "run"
+    with alone_in(folder), pytest.raises(RunError, match="another process runs in this folder"), alone_in(folder):
+        pass
+    with alone_in(folder):
+        assert list(folder.iterdir()) == []
 
 
 class TestOpening:

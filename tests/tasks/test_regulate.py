@@ -8,6 +8,7 @@ import torch
 import visadapt as va
 from tests.own_systems import Drive, Pendulum
 from visadapt.estimation.linearise import linearise_step
+from visadapt.targets.synthetic import fine_world
 from visadapt.tasks.linear_quadratic import linear_quadratic
 from visadapt.tasks.regulate import TaskFileError
 
@@ -64,13 +65,40 @@ def test_a_goal_at_which_the_derivative_is_not_finite_is_refused():
         va.Regulate(Orifice(), goal={"upper": -0.1}, tolerance={"lower": 0.01})
 
 
-def test_the_regulator_is_that_of_the_discrete_algebraic_riccati_equation():
-    world = va.World(Pendulum(), period=0.02)
-    solved = linear_quadratic(world, TILTED.weights, TILTED.command_weights, TILTED.at_goal, TILTED.held)
-    at, still = TILTED.at_goal[None], TILTED.held.expand(1, world.substeps, 1)
+@dataclass(frozen=True)
+class Greenhouse(va.System):
+    """A house that is heated, and loses what it has over that of outside."""
+
+    capacity: float = 2e6  # J/K
+    loss: float = 200.0  # W/K
+
+    name = "greenhouse"
+    prediction_time = 3600.0
+    states = (va.Variable("warmth", "K", -20.0, 40.0),)
+    actions = (va.Variable("power", "W", 0.0, 8000.0),)
+    loads = (va.Variable("heat", "W", -3000.0, 3000.0),)
+    coordinates = ((None, 0),)
+
+    def derivative(self, state, command, load):
+        return (command + load - self.loss * state) / self.capacity
+
+
+WARM = va.Regulate(Greenhouse(), goal={"warmth": 20.0}, tolerance={"warmth": 0.5}, seconds=6 * 3600)
+
+
+def test_a_target_of_a_slow_system_is_integrated_in_steps_of_its_own():
+    assert fine_world(Greenhouse(), (), 300.0).substeps == math.ceil(300.0 / (0.005 * 3600 / 0.5))
+    assert fine_world(Pendulum(), (), 0.02).substeps == 4
+
+
+@pytest.mark.parametrize(("task", "period"), [(TILTED, 0.02), (WARM, 300.0)])
+def test_the_regulator_is_that_of_the_discrete_algebraic_riccati_equation(task, period):
+    world = va.World(task.system, period=period)
+    solved = linear_quadratic(world, task.weights, task.command_weights, task.at_goal, task.held)
+    at, still = task.at_goal[None], task.held.expand(1, world.substeps, 1)
     step = linearise_step(world, torch.zeros(0).double(), torch.zeros(1).double(), at, still, by_command=True)
     a, b = step.by_state[0].numpy(), step.by_command[0].numpy()
-    weights, command = TILTED.weights.diag().numpy(), TILTED.command_weights.diag().numpy()
+    weights, command = task.weights.diag().numpy(), task.command_weights.diag().numpy()
     after = scipy.linalg.solve_discrete_are(a, b, weights, command)
     # s' V s leaves out the cost of s itself, which nothing can change.
     assert solved.to_go.numpy() == pytest.approx(after - weights, rel=1e-6)

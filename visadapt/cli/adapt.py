@@ -20,7 +20,7 @@ from visadapt.learning.explanation import Explanation
 from visadapt.policies import ImagePolicy
 from visadapt.setups.explained import check_diagnosable
 from visadapt.setups.training import adapt, setup_to_adapt
-from visadapt.storage.run_folder import open_run, write_json
+from visadapt.storage.run_folder import alone_in, open_run, write_json
 from visadapt.tasks.references import read_reference
 
 
@@ -46,8 +46,8 @@ def run(options: argparse.Namespace) -> None:
     if options.round and options.round > options.samples:
         raise InputError(f"--round {options.round} is more than --samples {options.samples}: lower it, or raise those")
     folder = Path(options.out)
-    open_run(folder, run_settings(options, "policy", "renderer", "references", "diagnosis", "map", "effects"))
-    with progress() as report:
+    with alone_in(folder), progress() as report:
+        open_run(folder, run_settings(options, "policy", "renderer", "references", "diagnosis", "map", "effects"))
         names = ("seed", "iterations", "renderer", "with_history", "diagnose")
         given: dict[str, Any] = {name: getattr(options, name) for name in names}
         given |= {"round_samples": options.round, "references": references, "report": report}

@@ -71,7 +71,8 @@ class Start:
 
 
 SMOOTH_STEP, ABRUPT_STEP = 0.005, 0.002
-"""s, the longest integration steps of a target under smooth effects alone, and under abrupt ones."""
+"""s, the longest integration steps of a target under smooth effects alone, and under abrupt ones; of a system that
+states a longer prediction time, longer in proportion."""
 
 
 def fine_world(system: System, effects: Sequence[Effect], period: float) -> World:
@@ -82,6 +83,7 @@ def fine_world(system: System, effects: Sequence[Effect], period: float) -> Worl
     10
     """
     longest = ABRUPT_STEP if any(effect.abrupt for effect in effects) else SMOOTH_STEP
+    longest *= max(1.0, system.prediction_time / System.prediction_time)
     return World(system, effects, period, "rk3", steps_within(period, longest)).requires_grad_(False)
 
 

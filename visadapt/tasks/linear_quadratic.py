@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -10,7 +11,7 @@ from torch import Tensor
 from visadapt.estimation.linearise import linearise_step
 from visadapt.world import World
 
-SUMMED_TIME = 50.0  # s over which costs are summed; what comes later adds next to nothing
+SUMMED_PREDICTIONS = 100.0  # Prediction times over which costs are summed; what comes later adds next to nothing
 MAX_GROWTH = 1e-4
 """Growth in a period, under the regulator, up to which a motion is steady: a position that costs nothing stays where it
 is, by an eigenvalue of 1."""
@@ -33,7 +34,7 @@ def linear_quadratic(
     """The regulator with the least sum of weighted squared distances and commands, in float64.
 
     The source, without its effects, is linearised at rest; the discrete algebraic Riccati equation is iterated from
-    V = 0 over SUMMED_TIME.
+    V = 0 over SUMMED_PREDICTIONS.
 
     Args:
         weights: (n_state,) of the squared distances. command_weights: (n_action,) of the squared commands.
@@ -51,7 +52,7 @@ def linear_quadratic(
     step = linearise_step(bare, bare.values.to(state), state.new_zeros(1), state, commands, by_command=True)
     a, b = step.by_state[0], step.by_command[0]
     to_go = torch.zeros_like(weights)
-    for _ in range(round(SUMMED_TIME / source.period)):
+    for _ in range(math.ceil(SUMMED_PREDICTIONS * source.system.prediction_time / source.period)):
         after = weights + to_go
         gain = torch.linalg.solve_ex(command_weights + b.T @ after @ b, b.T @ after @ a).result
         to_go = a.T @ after @ (a - b @ gain)
