@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from visadapt.policies import Policy, RegulatorPolicy
+from visadapt.policies.base import check_policy
 from visadapt.systems import CartPole
 from visadapt.targets import FlightTarget, Target
 from visadapt.targets.rollout import Run, check_period, run
@@ -104,6 +105,7 @@ def score(
         steps: of an episode; without it, those of the task, or 250.
 
     Raises:
+        TypeError: something else in the place of a policy.
         ValueError: more steps than the task of a flight has, no episode or step, a policy that was trained for another
             period or is shown a goal on a target that is no `FlightTarget`, or a target whose system is neither a
             vehicle nor a cart-pole, or that shows no cart speed.
@@ -113,6 +115,7 @@ def score(
     >>> found.survived, found.mean_speed < 1.0  # print(found) says both
     (2, True)
     """
+    check_policy(policy)
     if episodes < 1 or (steps is not None and steps < 1):
         raise ValueError(f"{episodes} episodes of {steps} steps; at least one of each is right")
     check_period(policy, target)

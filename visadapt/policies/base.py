@@ -7,6 +7,7 @@ what grounding has learnt, and adapts in far fewer iterations.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from typing import Any
 
@@ -112,6 +113,13 @@ class AutoregressivePolicy(Policy):
         away = torch.where(history.begins[:, None], 0.0, history.actions[:, -1] - self.rest)
         lasting = self.keep ** torch.arange(1, HORIZON + 1).to(away)
         return self.rest + away[:, None] * lasting[:, None]
+
+
+def check_policy(given: object) -> None:
+    """Raises TypeError where something else is given in the place of a policy: its file, say, or a run that made it."""
+    if not isinstance(given, Policy):
+        right = "load_policy reads a file" if isinstance(given, str | os.PathLike) else "a run has one as its .policy"
+        raise TypeError(f"a {type(given).__name__} is no policy: {right}")
 
 
 def ignore_correction(layer: nn.Linear, n_state: int) -> None:

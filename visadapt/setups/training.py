@@ -14,6 +14,7 @@ import torch
 from renderers import LayeredRenderer
 from visadapt.learning.joint import Adapted
 from visadapt.policies import ImagePolicy, Policy, RegulatorPolicy, StatePolicy
+from visadapt.policies.base import check_policy
 from visadapt.progress import Report
 from visadapt.setups.base import Setup
 from visadapt.setups.cartpole import cartpole_frames, cartpole_states
@@ -204,6 +205,7 @@ def adapt(
         ValueError: a policy of another system, a target of another period or with other actions, effects that cannot
             be fitted, too few samples, other references than a target's own, with a history, or arguments that are for
             a target where there is none.
+        TypeError: something else in the place of a policy or a world.
         TargetError: the target misbehaves.
 
     >>> import visadapt as va
@@ -214,6 +216,9 @@ def adapt(
     >>> result.ledger.used
     20
     """
+    check_policy(policy)
+    if not isinstance(source, World):
+        raise TypeError(f"adapt: {type(source).__name__} is no World; World(system, period=...) is right")
     _check_iterations(iterations)
     if target is None and (folder is not None or round_samples is not None or with_history or diagnose):
         raise ValueError("folder, round_samples, with_history and diagnose are for a target, and none is given")
