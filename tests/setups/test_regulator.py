@@ -52,6 +52,40 @@ def test_the_plan_of_a_new_policy_is_what_its_feedback_goes_on_to_do():
             history = history.acting(command).observing(at.state)
 
 
+class WithinATurn(va.RegulationTarget):
+    """Its sensor reads the angle between -pi and pi."""
+
+    def reset(self, batch, generator):
+        return self._read(super().reset(batch, generator))
+
+    def step(self, action):
+        return self._read(super().step(action))
+
+    def _read(self, seen):
+        turns = torch.tensor([1.0, 0.0]) * (seen.state / (2 * torch.pi)).round()
+        return replace(seen, state=seen.state - 2 * torch.pi * turns)
+
+
+def test_an_upright_angle_may_be_read_within_a_turn():
+    upright = va.Regulate(Pendulum(), goal={"angle": 3.0}, tolerance={"angle": 0.1, "rate": 1.0}, seconds=1.0)
+    policy = policy_of(upright)
+    runs = [
+        va.run(kind(upright, PERIOD, noise={"angle": 0.05}), policy, 5, 50, torch.Generator().manual_seed(0))
+        for kind in (va.RegulationTarget, WithinATurn)
+    ]
+    for plain, wrapped in zip(*runs, strict=True):
+        assert wrapped.survived
+        np.testing.assert_allclose(wrapped.episode.state, plain.episode.state, atol=1e-4)
+    assert max(each.episode.state[:, 0].max() for each in runs[1]) > np.pi
+
+
+def test_where_a_turn_further_is_elsewhere_or_the_range_is_of_several_turns_angles_are_read_as_they_are():
+    assert policy_of().turning == [0]
+    assert DRIVE.turning == []
+    far = torch.tensor([[7.0, 40.0, 0.0, 0.0]])
+    assert torch.equal(DRIVE.unwrapped(far, None), far)
+
+
 DRIVE = policy_of(va.Regulate(Drive(), tolerance={"disc": 0.05}))
 
 

@@ -65,6 +65,11 @@ class Policy(nn.Module):
         most = self.feedforward.weight.new_ones(self.n_action)
         return -most, most
 
+    def unwrapped(self, state: Tensor, before: Tensor | None) -> Tensor:
+        """States (B, n_state) that a target shows, in the turns in which the policy reads angles; `before` are those of
+        the instant before, None at first. Most policies read angles as they are."""
+        return state
+
     def embed(self, history: History) -> Tensor:
         """Inputs (B, inputs) of `plan` beside the correction: the features of frames, or the history itself."""
         raise NotImplementedError

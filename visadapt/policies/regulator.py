@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -17,6 +18,8 @@ WIDTH = 64  # of the MLP's layers
 LARGEST_CORRECTION = 4.0
 """In units of the residual's scale, the root mean square of the gap. A linear map has no bound of
 its own where a trajectory leaves the recorded states: without this one, tuning ended in NaN under a delay and a lag."""
+FARTHEST = 1.25 * math.pi
+"""rad from its goal up to which an angle's first reading is taken as it is; a pendulum may begin half a turn away."""
 UNIT_PERIODS = 10  # Periods in which the unit of acceleration changes a velocity by its unit
 
 
@@ -31,6 +34,7 @@ class RegulatorPolicy(Policy):
         unit: (n_state,) typical distances from it.
         low, high: (n_action,) the ranges of the commands.
         task: the settings of its task, which it keeps: `Regulate.settings`.
+        turning: names of angles in which the system is the same a turn further: a target may read them within a turn.
 
     >>> policy = RegulatorPolicy({"x": "m", "x_dot": "m/s"}, [0.5, 0.0], [0.1, 1.0], [-5.0], [5.0], {})
     >>> policy.act(History.start(torch.zeros(2, 2), n_action=1)).tolist()  # no law yet
@@ -50,9 +54,12 @@ class RegulatorPolicy(Policy):
         low: Sequence[float],
         high: Sequence[float],
         task: Mapping[str, Any],
+        turning: Sequence[str] = (),
     ) -> None:
         numbers = {"goal": list(goal), "unit": list(unit), "low": list(low), "high": list(high)}
-        super().__init__(len(goal), len(low), {"states": dict(states), **numbers, "task": dict(task)})
+        arguments = {"states": dict(states), **numbers, "task": dict(task), "turning": list(turning)}
+        super().__init__(len(goal), len(low), arguments)
+        self.turning = [list(states).index(name) for name in turning]
         self.states = dict(states)
         self.task = dict(task)
         for name, values in numbers.items():
@@ -67,6 +74,17 @@ class RegulatorPolicy(Policy):
     @property
     def command_range(self) -> tuple[Tensor, Tensor]:
         return self.low, self.high
+
+    def unwrapped(self, state: Tensor, before: Tensor | None) -> Tensor:
+        """Of the angles that are `turning`: the turn nearest to that before and, at first, that of the goal, unless the
+        reading is less than FARTHEST from it."""
+        columns, out = self.turning, state.clone()
+        away = state[:, columns] - (self.goal.to(state)[columns] if before is None else before[:, columns])
+        turns = (away / (2 * math.pi)).round()
+        if before is None:
+            turns = torch.where(away.abs() > FARTHEST, turns, 0.0)
+        out[:, columns] -= 2 * math.pi * turns
+        return out
 
     def in_units(self, history: History) -> History:
         """Distances from the goal in the policy's units, and commands in [-1, 1]."""

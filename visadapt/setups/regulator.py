@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from functools import partial
 
@@ -13,11 +14,15 @@ from visadapt.learning.grounding import GroundSettings
 from visadapt.learning.setup_settings import SetupSettings
 from visadapt.learning.tuning import TuneSettings
 from visadapt.policies import RegulatorPolicy
+from visadapt.recordings.physics import same_after_a_turn
 from visadapt.setups.base import Setup
 from visadapt.setups.policy_file import residual_for
+from visadapt.systems import System
 from visadapt.tasks.linear_quadratic import Regulator, linear_quadratic
 from visadapt.tasks.regulate import Regulate
 from visadapt.world import World
+
+TWO_TURNS = 4 * math.pi  # rad; of an angle with a smaller range, a turn further is another reading of the same place
 
 NEARLY = 0.999  # Largest share of a command's range that the policy holds at the goal before it is trained
 
@@ -64,6 +69,16 @@ def regulator(source: World, task: Regulate) -> Setup:
     )
 
 
+def _turning(system: System) -> list[str]:
+    """The angles that a sensor may read within a turn: those of a range below two, in which the system is the same a
+    turn further."""
+    return [
+        state.name
+        for state in system.states
+        if state.unit == "rad" and state.high - state.low < TWO_TURNS and same_after_a_turn(system, state.name)
+    ]
+
+
 def _policy(task: Regulate, solved: Regulator) -> RegulatorPolicy:
     """A policy whose plan is the regulator's, as long as its commands are small."""
     low, high = task.command_range
@@ -71,7 +86,7 @@ def _policy(task: Regulate, solved: Regulator) -> RegulatorPolicy:
     half_ranges = torch.tensor([(state.high - state.low) / 2 for state in task.system.states]).double()
     unit = task.spread.where(task.spread > 0, half_ranges)
     goal, ranges = task.at_goal.tolist(), (low.tolist(), high.tolist())
-    policy = RegulatorPolicy(states, goal, unit.tolist(), *ranges, task.settings())
+    policy = RegulatorPolicy(states, goal, unit.tolist(), *ranges, task.settings(), _turning(task.system))
     half, middle = (high - low) / 2, (high + low) / 2
     held = ((task.held - middle) / half).clamp(-NEARLY, NEARLY)
     slope = half * (1 - held.square())  # of the command by what the policy's last tanh takes

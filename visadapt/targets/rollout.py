@@ -93,7 +93,7 @@ def run(
     [(20, True), (20, True)]
     """
     see = see or SHOWN[policy.shown]
-    observation = checked_copy(target, target.reset(batch, generator), batch)
+    observation = _seen_by(policy, checked_copy(target, target.reset(batch, generator), batch), None)
     _check_finite(target, observation, torch.ones_like(observation.alive), "the first state")
     like = next(policy.parameters(), observation.state)
     history = History.start(see(observation).to(like), target.n_action)
@@ -111,7 +111,7 @@ def run(
         if added is not None:
             action = (action + added[len(rows)].to(action)).clamp(low, high)
         rows.append((observation if keep_frames else replace(observation, frame=None), action))
-        observation = checked_copy(target, target.step(action), batch)
+        observation = _seen_by(policy, checked_copy(target, target.step(action), batch), observation)
         finite = observation.state.isfinite().all(1)
         if strict:
             _check_finite(target, observation, running, f"the state after step {len(rows)}")
@@ -165,6 +165,12 @@ def checked_copy(target: Target, observation: Any, batch: int) -> Observation:
             raise TargetError(f"{target.name}: {name} is {what}; a torch tensor that is {needed} is right")
         copies[name] = value.clone()
     return Observation(**copies)
+
+
+def _seen_by(policy: Policy, observation: Observation, before: Observation | None) -> Observation:
+    """The observation with angles in the turns in which the policy reads them."""
+    state = policy.unwrapped(observation.state, None if before is None else before.state)
+    return replace(observation, state=state)
 
 
 def _check_finite(target: Target, observation: Observation, rows: Tensor, which: str) -> None:
