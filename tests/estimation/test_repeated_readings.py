@@ -82,3 +82,12 @@ def test_a_zone_may_hold_the_hanging_pole(turns):
     edges, deviations = zone((angle > first) & (angle < last), angle, 1e-3)
     assert edges.tolist() == pytest.approx([first, last], abs=0.005)
     assert (deviations < 0.005).all()
+
+
+def test_a_machine_that_starts_slowly_from_a_few_rows_at_rest_has_lost_none():
+    position = torch.tensor([0.0, 0.0, 0.0, 1.0, 2.0, 4.0, 7.0]).double() * COUNTS[0]
+    # A filter's velocity moves in far finer steps, so it leaves its rest at speed.
+    velocity = torch.tensor([0.0, 0.0, 0.0, 1.9e-3, 3.8e-3, 7.1e-3, 1.1e-2]).double()
+    rows = torch.stack((position, velocity), 1)
+    rows = torch.cat((rows, rows[-1] + torch.stack((0.01 * torch.arange(1, 90), 0.3 + 1e-3 * torch.arange(1, 90)), 1)))
+    assert not bool(find_repeats([rows], (0, 1), ANGLE).lost[0].any())

@@ -103,11 +103,12 @@ def _equal(values: Tensor) -> Tensor:
 
 def _resting(values: Tensor, steps: Tensor) -> Tensor:
     """Which rows (T, m) repeat the first one of an episode because the machine rests: they are too many to have been
-    lost, or not every sensor, of resolutions `steps` (m,), leaves them at speed."""
+    lost, or a sensor, of resolutions `steps` (m,), leaves them slowly."""
     still = (values == values[:1]).all(1).cumprod(0) > 0
     count = int(still.sum())
-    leaves = (values[count : count + 1] - values[:1]).abs() > MIN_JUMP_STEPS * steps
-    return still if count > MIN_REST_ROWS or not leaves.all() else torch.zeros_like(still)
+    change = (values[count : count + 1] - values[:1]).abs()
+    slowly = (change > 0) & (change <= MIN_JUMP_STEPS * steps)
+    return still if count > MIN_REST_ROWS or slowly.any() else torch.zeros_like(still)
 
 
 def _repeats(readings: Tensor, step: float) -> Tensor:

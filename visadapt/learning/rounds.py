@@ -35,7 +35,7 @@ from visadapt.progress import Progress, Report, staged
 from visadapt.recordings import Episode, read_recording, write_recording
 from visadapt.storage.checkpoints import CheckpointError, fitting, load_tree, load_weights, save_tree
 from visadapt.systems import System
-from visadapt.targets import Target, TargetError
+from visadapt.targets import FlightTarget, Target, TargetError
 from visadapt.targets.rollout import run
 from visadapt.world import World
 
@@ -200,7 +200,9 @@ class JointLearning:
         nothing."""
         if self.explorer is not None:
             return ""
-        episodes, longest, task = iter(self.episodes), self.settings.longest_episode, self.settings.tuning.task
+        # Of a flight, the target's own task, whose references may be others than those that tuning takes.
+        task = self.target.task if isinstance(self.target, FlightTarget) else self.settings.tuning.task
+        episodes, longest = iter(self.episodes), self.settings.longest_episode
         rounds = [list(islice(episodes, count)) for count in self._collected]
         why = setback([Performance.of(each, longest, task) for each in rounds])
         if why:

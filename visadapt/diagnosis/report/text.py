@@ -22,7 +22,6 @@ from visadapt.diagnosis.result import (
     Region,
     without_slight,
 )
-from visadapt.diagnosis.search.heldout import MIN_GAP
 from visadapt.diagnosis.words import (
     BESIDE_PUSHES,
     MISFIT,
@@ -75,7 +74,7 @@ def effects(names: Sequence[str]) -> str:
 def sentence(diagnosis: Diagnosis) -> str:
     """The verdict in one plain sentence, with physical units."""
     gap = diagnosis.gap
-    if diagnosis.verdict == NO_GAP and gap.before > MIN_GAP * gap.floor:
+    if diagnosis.verdict == NO_GAP and not math.isnan(gap.closed):
         return (
             f"No gap that an effect explains: predictions err by {number(gap.before)}, the noise alone by "
             f"{number(gap.floor)}, and nothing that was tried is clearly there."
