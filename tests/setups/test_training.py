@@ -2,6 +2,7 @@
 
 import copy
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -134,12 +135,15 @@ def test_a_policy_that_aims_at_goals_of_another_clock_is_refused():
 
 
 def test_what_is_no_policy_or_no_world_is_told_what_would_be(policy):
+    file: Any = "policy.safetensors"
+    network: Any = torch.nn.Linear(4, 1)
+    system: Any = va.CartPole()
     with pytest.raises(TypeError, match=r"^a str is no policy: load_policy reads a file$"):
-        va.score("policy.safetensors", va.SyntheticTarget())
+        va.score(file, va.SyntheticTarget())
     with pytest.raises(TypeError, match=r"^a Linear is no policy: a run has one as its \.policy$"):
-        va.adapt(torch.nn.Linear(4, 1), va.World(va.CartPole()), va.SyntheticTarget())
+        va.adapt(network, va.World(va.CartPole()), va.SyntheticTarget())
     with pytest.raises(TypeError, match=r"^adapt: CartPole is no World; World\(system, period=\.\.\.\) is right$"):
-        va.adapt(policy, va.CartPole(), va.SyntheticTarget())
+        va.adapt(policy, system, va.SyntheticTarget())
 
 
 def test_a_flight_is_scored_over_fewer_steps_than_its_task_has_but_not_over_more():
