@@ -50,6 +50,7 @@ def test_episodes_that_end_early_and_the_cost_of_the_others():
     faster = Performance.of([still(13, 2.0), still(14, 2.0), still(6, 2.0)], 20, task)
     assert faster.cost > found.cost > 0
     assert math.isnan(Performance.of([still(6, 1.0)], 20, task).cost)
+    assert math.isnan(Performance.of([still(13, 1.0)], 20, None).cost)
 
 
 def test_under_a_late_motor_the_policy_stays_what_it_was(tmp_path):

@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +36,7 @@ from visadapt.storage.checkpoints import CheckpointError, fitting, load_tree, lo
 from visadapt.systems import System
 from visadapt.targets import FlightTarget, Target, TargetError
 from visadapt.targets.rollout import run
+from visadapt.tasks.base import Task
 from visadapt.world import World
 
 COLLECTING, GROUNDING, TUNING, ACCEPTING = range(4)  # Stages of a round, each with random numbers of its own
@@ -141,7 +141,7 @@ class JointLearning:
                 load_weights(self.residual, self.policy.residual.state_dict(), Path("the policy's residual"))
         self.policy.residual = self.residual
         self._began_with = copy.deepcopy(self.policy.state_dict())
-        self._collected: list[int] = []  # episodes of each round
+        self._collected: list[list[Episode]] = []  # those of each round
 
     @property
     def known(self) -> World:
@@ -193,18 +193,22 @@ class JointLearning:
         for episode in collected:
             self.ledger.count(f"{folder.name}: data", episode.samples)
         self.waiting += collected
-        self._collected.append(len(collected))
+        self._collected.append(collected)
 
     def take_back(self) -> str:
         """Give the policy what it began with, if it did much worse in later rounds' data than in the first's; why, or
         nothing."""
         if self.explorer is not None:
             return ""
-        # Of a flight, the target's own task, whose references may be others than those that tuning takes.
-        task = self.target.task if isinstance(self.target, FlightTarget) else self.settings.tuning.task
-        episodes, longest = iter(self.episodes), self.settings.longest_episode
-        rounds = [list(islice(episodes, count)) for count in self._collected]
-        why = setback([Performance.of(each, longest, task) for each in rounds])
+        # Of a flight, the target's own task, whose references may be others than those that tuning takes; of frames
+        # none, since the target's states are not for a policy that sees frames.
+        task: Task | None = self.settings.tuning.task
+        if isinstance(self.target, FlightTarget):
+            task = self.target.task
+        elif self.observe is not None:
+            task = None
+        longest = self.settings.longest_episode
+        why = setback([Performance.of(each, longest, task) for each in self._collected])
         if why:
             self.policy.load_state_dict(self._began_with)
             self.found = NOT_DIAGNOSED

@@ -6,6 +6,7 @@ which the machine is not. Only the machine shows it, in the data that the next r
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -30,18 +31,19 @@ class Performance:
 
     steps: int
     failures: int  # episodes that ended early
-    cost: float  # mean cost of what was executed, by the task; NaN where no states are known
+    cost: float  # mean cost of what was executed, by the task; NaN where that is not known
 
     @classmethod
-    def of(cls, episodes: Sequence[Episode], longest: int, task: Task) -> Performance:
-        """Of the episodes of a round, in which none was to last more than `longest` steps."""
+    def of(cls, episodes: Sequence[Episode], longest: int, task: Task | None) -> Performance:
+        """Of the episodes of a round, in which none was to last more than `longest` steps; without a task, at no cost
+        that is known."""
         left = steps = sum(episode.samples for episode in episodes)
         failures = 0
         for episode in episodes:
             failures += episode.samples < min(left, longest)
             left -= episode.samples
-        costs = np.concatenate([_costs(episode, task) for episode in episodes])
-        return cls(steps, failures, float(costs.mean()) if len(costs) else float("nan"))
+        costs = np.concatenate([np.zeros(0), *(_costs(episode, task) for episode in episodes if task is not None)])
+        return cls(steps, failures, float(costs.mean()) if len(costs) else math.nan)
 
 
 @torch.no_grad()
@@ -72,7 +74,7 @@ def setback(rounds: Sequence[Performance]) -> str:
             f"{last.failures} of its episodes on the machine ended early, in {last.steps} steps; of the policy that it "
             f"began as {first.failures} did, in {first.steps}"
         )
-    ratio = float(np.median([one.cost for one in later])) / first.cost
-    if ratio > (MUCH_WORSE if len(later) >= FEW_ROUNDS else MUCH_WORSE_ONCE):
-        return f"on the machine it cost {ratio:.3g} times what the policy did that it began as"
+    cost = float(np.median([one.cost for one in later]))
+    if cost > first.cost * (MUCH_WORSE if len(later) >= FEW_ROUNDS else MUCH_WORSE_ONCE) > 0:
+        return f"on the machine it cost {cost / first.cost:.3g} times what the policy did that it began as"
     return ""
