@@ -73,7 +73,7 @@ def explore(
     repeats = repeated_reading_causes(prepared, search, comparison, repeating)
     apart: tuple[ExplainedAlone, ...] = ()
     if comparison.leftover > MIN_LEFTOVER and not comparison.negligible and jumping is None:
-        apart = explained_apart(searched_in, recording.sources, progress)
+        apart = explained_apart(searched_in, candidates, recording.sources, progress)
     if not apart:
         again = staged(progress, "search with coloured noise")
         search, comparison = with_coloured_noise(search, comparison, prepared.searched, again)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visadapt.recordings.columns import read_column
-from visadapt.recordings.episode import RecordingError
+from visadapt.recordings.episode import EPISODE, RecordingError
 from visadapt.systems import System
 
 Note = Callable[[str, str], None]
@@ -79,7 +79,7 @@ class RawEpisode:
     @property
     def origin(self) -> str:
         """The file, and the episode if the file has several, for messages."""
-        return str(self.path) if self.number is None else f"{self.path}, episode {self.number:.15g}"
+        return str(self.path) if self.number is None else f"{self.path}{EPISODE}{self.number:.15g}"
 
     @property
     def states(self) -> dict[str, NDArray[np.float64]]:

@@ -7,6 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+EPISODE, FROM = ", episode ", ", from "
+"""What stands behind a file in `Recording.sources` and in messages, before the number of an episode in it, and before
+the time of a stretch of it."""
+
 
 class RecordingError(ValueError):
     """A recording that cannot be used; the message is one line: which file and episode, and what would be right."""
@@ -115,3 +119,12 @@ class Recording:
     def samples(self) -> int:
         """Executed actions."""
         return sum(episode.samples for episode in self.episodes)
+
+
+def file_of(source: str) -> str:
+    """The file of one of `Recording.sources`.
+
+    >>> file_of("runs.h5, episode 3, from 12.0 s")
+    'runs.h5'
+    """
+    return source.partition(EPISODE)[0].partition(FROM)[0]

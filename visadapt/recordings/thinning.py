@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from visadapt.recordings.episode import Recording
+from visadapt.recordings.episode import FROM, Recording
 
 STRETCH = 5000  # Rows of a file that are kept or left out together
 
@@ -50,7 +50,7 @@ def spread(recording: Recording, most: int, length: int, before: int) -> Recordi
         assert episode.state is not None
         time, action, state = episode.time[led], episode.action[led], episode.state[led]
         episodes.append(replace(episode, time=time, action=action, state=state, task_state=None))
-        sources.append(f"{recording.sources[number]}, from {episode.time[own.start]:.1f} s")
+        sources.append(f"{recording.sources[number]}{FROM}{episode.time[own.start]:.1f} s")
         usable.append(every[number][led] & (np.arange(led.start, led.stop) >= own.start))
     used = sum(own.stop - own.start for _, own in chosen)
     return replace(

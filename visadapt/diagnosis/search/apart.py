@@ -9,7 +9,9 @@ import torch
 
 from visadapt.diagnosis.search.fitted_models import ScoredModel
 from visadapt.diagnosis.search.search import Search
+from visadapt.effects import Effect
 from visadapt.progress import Report, staged
+from visadapt.recordings.episode import file_of
 
 MOST_RECORDINGS = 8  # that are explained one by one
 
@@ -25,21 +27,24 @@ class ExplainedAlone:
 
 
 def explained_apart(
-    search: Search, sources: Sequence[str], progress: Report | None = None
+    search: Search, catalogue: Sequence[type[Effect]], sources: Sequence[str], progress: Report | None = None
 ) -> tuple[ExplainedAlone, ...]:
     """What explains each recording by itself, where that is everything and is likelier than the best set of a search in
     all of them together; else nothing.
 
-    `sources` are the recordings that the episodes are of. The first that is not explained by itself ends the attempt.
+    Args:
+        catalogue: the effects that are searched.
+        sources: of each episode (`Recording.sources`); those of a file are one recording. The first recording that is
+            not explained by itself ends the attempt.
     """
-    files = [sources[episode] for episode in search.rows.episode.tolist()]
+    files = [file_of(sources[episode]) for episode in search.rows.episode.tolist()]
     names = list(dict.fromkeys(files))
     if not 1 < len(names) <= MOST_RECORDINGS:
         return ()
     out = []
     for name in names:
         windows = torch.tensor([window for window, file in enumerate(files) if file == name])
-        alone = Search(search.system, search.rows.select(windows), search.catalogue, jobs=search.jobs)
+        alone = Search(search.system, search.rows.select(windows), catalogue, jobs=search.jobs)
         alone.run(staged(progress, f"search in {name} alone"))
         if not alone.explains_all(alone.best):
             return ()
