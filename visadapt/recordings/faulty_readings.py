@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from visadapt.recordings.clock import Note, RawEpisode
 from visadapt.recordings.episode import RecordingError
 from visadapt.recordings.runs import runs
-from visadapt.recordings.sensors import FROZEN_ROWS, TURN, differences
-from visadapt.systems import System, Variable
+from visadapt.recordings.sensors import FROZEN_ROWS, TURN, differences, variable_of
+from visadapt.systems import System
 
 OUTLIER_SCALES = 50.0
 """Jump of a reading above which it may be an outlier, in usual departures from the mean of its neighbours."""
@@ -52,13 +52,13 @@ def without_outliers(raw: RawEpisode, system: System, note: Note) -> RawEpisode:
         return raw
     bad = np.zeros(len(raw.time), bool)
     for name, values in raw.states.items():
-        variable = _variable(system, name)
+        variable = variable_of(system, name)
         if variable.unit == "1":  # as a quaternion's, whose sign may change
             continue
         rate = system.rate_of(name)
         allowed = variable.largest
         if rate is not None:
-            allowed = min(allowed, 2 * float(np.median(np.diff(raw.time))) * _variable(system, rate).largest)
+            allowed = min(allowed, 2 * float(np.median(np.diff(raw.time))) * variable_of(system, rate).largest)
         outliers = _outliers(differences(values, variable.unit == "rad"), values, allowed)
         if outliers.mean() > MOST_OUTLIERS:
             row = int(outliers.argmax())
@@ -118,7 +118,7 @@ def _interpolated(raw: RawEpisode, bad: NDArray[np.bool_], system: System) -> Ra
     for column, name in enumerate(raw.measured):
         values = raw.state[:, column]
         step = values[after] - values[before]
-        if _variable(system, name).unit == "rad":
+        if variable_of(system, name).unit == "rad":
             step -= TURN * np.round(step / TURN)
         state[rows, column] = values[before] + share * step
     return replace(raw, state=state, usable=~bad)
@@ -146,12 +146,7 @@ def jumps(raw: RawEpisode, system: System, note: Note) -> list[int]:
             note(
                 f"{name} is suddenly elsewhere and stays there: its sensor lost count, or was moved; the episode was "
                 "split",
-                f"{raw.cell(row, name)}, by {departs[row - 1]:.3g} {_variable(system, name).unit}",
+                f"{raw.cell(row, name)}, by {departs[row - 1]:.3g} {variable_of(system, name).unit}",
             )
             rows.add(row)
     return sorted(rows)
-
-
-def _variable(system: System, name: str) -> Variable:
-    """The state of this name."""
-    return system.states[system.index(name)]

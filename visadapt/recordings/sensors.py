@@ -49,7 +49,7 @@ def check_sensors(episodes: Sequence[RawEpisode], system: System, note: Note) ->
     """
     for raw in episodes:
         for name, values in raw.states.items():
-            variable, row = _variable(system, name), int(np.abs(values).argmax())
+            variable, row = variable_of(system, name), int(np.abs(values).argmax())
             limit = ABSURD_RANGES * variable.largest
             if abs(values[row]) > (ABSURD_TURNS * TURN if variable.unit == "rad" else limit):
                 raise RecordingError(
@@ -86,13 +86,13 @@ def check_sensors(episodes: Sequence[RawEpisode], system: System, note: Note) ->
 
 
 def _is_still(values: NDArray[np.float64], system: System, name: str) -> bool:
-    return float(np.ptp(values)) <= STILL_RANGES * _variable(system, name).largest
+    return float(np.ptp(values)) <= STILL_RANGES * variable_of(system, name).largest
 
 
 def _must_move(raw: RawEpisode, system: System, name: str) -> bool:
     """Whether the source says that a state that is measured does not stand still."""
     columns = {
-        name: np.unwrap(values) if _variable(system, name).unit == "rad" else values
+        name: np.unwrap(values) if variable_of(system, name).unit == "rad" else values
         for name, values in raw.states.items()
     }
     for position in raw.measured:
@@ -102,11 +102,11 @@ def _must_move(raw: RawEpisode, system: System, name: str) -> bool:
     load = torch.zeros(len(state), len(system.loads), dtype=torch.float64)
     change = system.derivative(torch.from_numpy(state), torch.from_numpy(raw.action), load).numpy()
     moved = system.rate_of(name) or name
-    largest = _variable(system, moved).largest
+    largest = variable_of(system, moved).largest
     return float(np.abs(change[:, system.index(moved)]).max()) > MOVING_RANGES * largest
 
 
-def _variable(system: System, name: str) -> Variable:
+def variable_of(system: System, name: str) -> Variable:
     """The state of this name."""
     return system.states[system.index(name)]
 
@@ -114,7 +114,7 @@ def _variable(system: System, name: str) -> Variable:
 def _check_not_frozen(raw: RawEpisode, system: System) -> None:
     """Raises RecordingError where a position stands still while its rate, which is measured, says that it moves."""
     for name, values in raw.states.items():
-        variable = _variable(system, name)
+        variable = variable_of(system, name)
         rate = raw.states.get(system.rate_of(name) or "")
         # An angle that stands still in places is an effect of the catalogue.
         if rate is None or variable.unit == "rad":
@@ -136,7 +136,7 @@ def _note_noise(raw: RawEpisode, system: System, note: Note) -> None:
     for name, values in raw.states.items():
         if system.rate_of(name) is None or len(values) < FEWEST_NOISY or not np.ptp(values):
             continue
-        values = np.unwrap(values) if _variable(system, name).unit == "rad" else values
+        values = np.unwrap(values) if variable_of(system, name).unit == "rad" else values
         if np.diff(values).var() > NOISE_RATIO * values.var() and _must_move(raw, system, name):
             note(
                 f"{name} jumps about from row to row and does not move, although what is commanded and measured moves "
