@@ -97,7 +97,7 @@ def test_a_rate_that_never_changes_is_left_out(file, run, name):
 )
 def test_an_outlier_is_set_aside(file, run, name, value):
     recording = load(write(file, changed(run, **{name: at(50, value)})))
-    (episode,), (usable,) = recording.episodes, recording.usable
+    (episode,), (usable,) = recording.episodes, (read.all(1) for read in recording.usable)
     assert np.flatnonzero(~usable).tolist() == [50]
     said = f"{file}: row 51 (line 52), column '{name}': {value:g}: lies far off the rows before and after: an outlier"
     assert recording.warnings[0].startswith(said)
@@ -109,7 +109,7 @@ def test_an_outlier_is_set_aside(file, run, name, value):
 
 def test_some_outliers_in_a_row(file, run):
     recording = load(write(file, changed(run, x=at(slice(50, 53), 120))))
-    assert [np.flatnonzero(~usable).tolist() for usable in recording.usable] == [[50, 51, 52]]
+    assert [np.flatnonzero(~read.all(1)).tolist() for read in recording.usable] == [[50, 51, 52]]
     assert (
         "row 51 (line 52), column 'x': 120 and 2 more: lies far off the rows before and after" in recording.warnings[0]
     )

@@ -70,9 +70,9 @@ class TestText:
     @pytest.mark.parametrize(
         ("cell", "message"),
         [
-            ("nan", "column 'theta' is nan; a finite number is right"),
+            ("nan", "column 'theta' is empty or nan; a finite number is right"),
             ("inf", "column 'theta' is inf"),
-            ("", "column 'theta' is empty"),
+            ("", "column 'theta' is empty or nan"),
             ("oops", "column 'theta' is 'oops'; a number is right"),
             ('"0,12"', "column 'theta' is '0,12'; a decimal point is right"),
             ("1_0.5", "column 'theta' is '1_0.5'; a number is right"),

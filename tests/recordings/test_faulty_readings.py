@@ -28,7 +28,7 @@ def test_what_a_stuck_sensor_repeats_is_set_aside(file, run):
     x = moved(ROWS)
     true, x[61:75] = x.copy(), x[60]
     recording = load(write(file, with_x(run, x)), columns={"x_dot": ""})
-    (episode,), (usable,) = recording.episodes, recording.usable
+    (episode,), (usable,) = recording.episodes, (read.all(1) for read in recording.usable)
     assert np.flatnonzero(~usable).tolist() == list(range(61, 75))
     np.testing.assert_allclose(episode.state[usable, 0], true[usable])
     np.testing.assert_allclose(np.diff(episode.state[60:76, 0]), (true[75] - true[60]) / 15)

@@ -334,14 +334,14 @@ def _check_order(recording: Recording, seen: Sequence[_Seen], clear: Sequence[ND
 def _parts(
     recording: Recording, seen: Sequence[_Seen], clear: Sequence[NDArray[np.bool_]]
 ) -> Iterator[tuple[Episode, NDArray[np.bool_], str, NDArray[np.uint8]]]:
-    """The stretches of the episodes without long misses: poses, which rows are usable, origin, and frames."""
+    """The stretches of the episodes without long misses: poses, which of them are usable, origin, and frames."""
     for episode, poses, used, origin in zip(recording.episodes, seen, clear, recording.sources, strict=True):
         assert episode.frame is not None
         for first, last in _stretches(used, recording.period):
             rows = slice(first, last)
             time, action = episode.time[rows], episode.action[rows]
             part = replace(episode, time=time, action=action, state=poses.pose[rows], frame=None)
-            yield part, (used & poses.usual)[rows], origin, episode.frame[rows]
+            yield part, np.repeat((used & poses.usual)[rows, None], len(POSE), 1), origin, episode.frame[rows]
 
 
 def _misses(recording: Recording, clear: Sequence[NDArray[np.bool_]]) -> Iterator[str]:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from visadapt.estimation.segments import smallest_step
+from visadapt.estimation.segments import resolutions
 
 MIN_JUMP_STEPS, MIN_OTHER_STEPS = 8, 1.5
 """For a run of equal readings to count as repeated, the larger of the two changes into and out of it must exceed
@@ -49,21 +49,32 @@ class RepeatedReadings:
 
 
 def find_repeats(
-    measured: Sequence[Tensor], channels: tuple[int, ...], angle_sensor: Sequence[int]
+    measured: Sequence[Tensor],
+    channels: tuple[int, ...],
+    angle_sensor: Sequence[int],
+    usable: Sequence[Tensor] | None = None,
 ) -> RepeatedReadings:
     """Find repeated readings in episodes (T, m) of these columns of the state.
 
-    `angle_sensor` are the columns of the angle, which may stand still on its own, and of its rate; empty without one.
+    Args:
+        angle_sensor: the columns of the angle, which may stand still on its own, and of its rate; empty without one.
+        usable: (T, m) of each episode, above 0 where there is a reading; None: everywhere.
     """
     changes = torch.cat([values.diff(dim=0) for values in measured])
-    steps = [smallest_step(torch.cat([values[:, k] for values in measured])) for k in range(len(channels))]
+    usable = usable or [torch.ones_like(values) for values in measured]
+    steps = resolutions(measured, usable)
     by_chance = [_equal_by_chance(changes[:, k], step) for k, step in enumerate(steps)]
     of_angle = torch.tensor([c in angle_sensor for c in channels], dtype=torch.bool)
     angle = channels.index(angle_sensor[0]) if angle_sensor and angle_sensor[0] in channels else None
-    same = [torch.stack([_repeats(values[:, k], steps[k]) for k in range(len(channels))], 1) for values in measured]
+    read_twice = [_also_before(read > 0) for read in usable]
+    same = [
+        torch.stack([_repeats(values[:, k], steps[k]) for k in range(len(channels))], 1) & twice
+        for values, twice in zip(measured, read_twice, strict=True)
+    ]
     resting = [_resting(values, torch.tensor(steps).to(values)) for values in measured]
     whole_rows = [
-        _equal(values).all(1) & each.any(1) & ~rest for values, each, rest in zip(measured, same, resting, strict=True)
+        (_equal(values) | ~twice).all(1) & each.any(1) & ~rest
+        for values, twice, each, rest in zip(measured, read_twice, same, resting, strict=True)
     ]
     lost = _unless_by_chance(whole_rows, min(by_chance))
     # A rate from a separate sensor may go on while the angle stands still.
@@ -71,6 +82,11 @@ def find_repeats(
     if angle is not None:
         alone = [each[:, angle] & ~whole & ~rest for each, whole, rest in zip(same, whole_rows, resting, strict=True)]
         frozen = _unless_by_chance(alone, by_chance[angle])
+        if any(bool(still.any()) for still in frozen):
+            # What a sensor slower than the rows might have shown in a row is unknown.
+            unknown = [row & ~twice.all(1) for row, twice in zip(lost, read_twice, strict=True)]
+            frozen = [still | row for still, row in zip(frozen, unknown, strict=True)]
+            lost = [row & ~other for row, other in zip(lost, unknown, strict=True)]
     used = []
     doubtful = frozen if angle is None else _between_held([values[:, angle] for values in measured], frozen)
     for whole, still in zip(lost, doubtful, strict=True):
@@ -99,6 +115,11 @@ def _between_held(angles: Sequence[Tensor], frozen: Sequence[Tensor]) -> list[Te
 def _equal(values: Tensor) -> Tensor:
     """Which values (T, ...) equal those of the row before."""
     return torch.cat((torch.zeros_like(values[:1], dtype=torch.bool), values.diff(dim=0) == 0))
+
+
+def _also_before(read: Tensor) -> Tensor:
+    """Which of the values (T, m) were `read`, and those of the row before too."""
+    return torch.cat((torch.zeros_like(read[:1]), read[1:] & read[:-1]))
 
 
 def _resting(values: Tensor, steps: Tensor) -> Tensor:

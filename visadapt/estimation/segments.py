@@ -193,9 +193,15 @@ def _last_rows(rows: Segments) -> tuple[Tensor, Tensor]:
 
 def noise_of_readings(rows: Segments) -> Tensor:
     """(m,) variances of the readings' noise, from their third differences, in which smooth motion nearly vanishes."""
-    third, weights = rows.filled.diff(n=3, dim=1), rows.used.unfold(1, 4, 1).prod(-1)
-    # The squares of the coefficients 1, 3, 3 and 1 sum to 20.
-    return (weights * third.square()).sum((0, 1)) / (20 * weights.sum((0, 1)).clamp(min=1))
+    windows, length = rows.shape
+    place = (2 * length * torch.arange(windows)[:, None] + torch.arange(length)).flatten()  # apart, in two windows
+    out = rows.measured.new_zeros(len(rows.channels))
+    for k, (values, read) in enumerate(zip(rows.measured.flatten(0, 1).T, rows.used.flatten(0, 1).T > 0, strict=True)):
+        third, span = values[read].diff(n=3), place[read][3:] - place[read][:-3]
+        if len(span):
+            # The squares of the coefficients 1, 3, 3 and 1 sum to 20.
+            out[k] = third[span == span.median()].square().mean() / 20
+    return out
 
 
 def cut(
@@ -243,7 +249,7 @@ def cut(
         held[index, : len(values) - 1] = stamp.diff()
     first = torch.tensor([a for _, a, _ in pieces])
     episode = torch.tensor([index for index, _, _ in pieces])
-    resolution = tuple(smallest_step(torch.cat([values[:, k] for values in measured])) for k in range(len(channels)))
+    resolution = tuple(resolutions(measured, valid))
     return Segments(out, used, inside, time, command, held, first, episode, channels, period, resolution)
 
 
@@ -290,6 +296,12 @@ def stretches_without(bad: Sequence[Tensor], stretches: Sequence[Stretch]) -> li
         parts = [(index, a + 1, b) for a, b in pairwise(edges)]
         out += parts if len(parts) == 1 else [part for part in parts if part[2] - part[1] >= MIN_STRETCH_ROWS]
     return out
+
+
+def resolutions(measured: Sequence[Tensor], valid: Sequence[Tensor]) -> list[float]:
+    """The resolution of the sensor of each column of episodes (T, m), by its `valid` (T, m) readings."""
+    readings, read = torch.cat([*measured]), torch.cat([*valid]) > 0
+    return [smallest_step(values[kept]) for values, kept in zip(readings.T, read.T, strict=True)]
 
 
 def smallest_step(readings: Tensor) -> float:

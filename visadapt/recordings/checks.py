@@ -47,9 +47,9 @@ def check_finite(raw: RawEpisode, actions: Sequence[Variable]) -> None:
     if bad.any():
         row, column = np.argwhere(bad)[0]
         name = ("time", *raw.measured, *(variable.name for variable in actions))[column]
+        value = "empty or nan" if np.isnan(table[row, column]) else table[row, column]
         raise RecordingError(
-            f"{raw.cell(int(row), name)} is {table[row, column]}; a finite number is right (leave out rows without a "
-            "measurement)"
+            f"{raw.cell(int(row), name)} is {value}; a finite number is right (leave out rows without a measurement)"
         )
 
 

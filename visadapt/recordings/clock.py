@@ -74,7 +74,7 @@ class RawEpisode:
     frame: NDArray[np.uint8] | None = None
     """(T, H, W), where frames are read in the place of states"""
     usable: NDArray[np.bool_] | None = None
-    """(T,) which rows are measurements; without it, all are"""
+    """(T, n_measured) which readings are measurements; without it, all are"""
 
     @property
     def origin(self) -> str:
@@ -85,6 +85,11 @@ class RawEpisode:
     def states(self) -> dict[str, NDArray[np.float64]]:
         """The columns (T,) of state, by name."""
         return dict(zip(self.measured, self.state.T, strict=True))
+
+    def read(self, name: str) -> NDArray[np.intp]:
+        """The rows in which a state was measured."""
+        every = np.arange(len(self.time))
+        return every if self.usable is None else every[self.usable[:, self.measured.index(name)]]
 
     def column(self, name: str) -> str:
         """The name in messages of a variable's column."""
@@ -101,6 +106,12 @@ class RawEpisode:
     def cell(self, row: int, name: str) -> str:
         """Where in the file a value stands, for messages."""
         return f"{self.origin}: {self.place(row)}, {self.column(name)}"
+
+    def of(self, names: Sequence[str]) -> RawEpisode:
+        """With these of the measured states."""
+        columns = [self.measured.index(name) for name in names]
+        usable = None if self.usable is None else self.usable[:, columns]
+        return replace(self, measured=tuple(names), state=self.state[:, columns], usable=usable)
 
     def part(self, start: int, end: int) -> RawEpisode:
         """The rows from `start` up to, but not including, `end`."""

@@ -26,6 +26,7 @@ from visadapt.recordings.clock import Note, RawEpisode
 from visadapt.recordings.columns import convert, match
 from visadapt.recordings.episode import RecordingError
 from visadapt.recordings.runs import runs
+from visadapt.recordings.slow_sensors import with_empty_cells
 from visadapt.recordings.thinning import STRETCH, thinned
 from visadapt.systems import System
 
@@ -179,7 +180,7 @@ class Table:
                 raise RecordingError(f"{where} has {len(cells)} cells, the line of names {len(self.header)}")
             used = [cells[column].partition("#")[0] for column in columns]
             try:
-                values = [_number(cell) for cell in used]
+                values = [_number(cell) if cell.strip() else math.nan for cell in used]
             except ValueError:
                 column, cell = next(each for each in zip(columns, used, strict=True) if not _is_number(each[1]))
                 raise RecordingError(f"{where}, column {self.header[column]!r} {_complaint(cell)}") from None
@@ -234,7 +235,7 @@ def read_rows(
     names = {name: table.header[index] for name, index in found.items()}
     whole = RawEpisode(path, values["time"], action, state, measured, rows.place, names, given)
     if "episode" not in found:
-        return [whole]
+        return [with_empty_cells(whole, system, note)]
     label = values["episode"]
     if np.isnan(label).any():
         raise RecordingError(f"{path}: {rows.place(int(np.isnan(label).argmax()))}, column 'episode' is not a number")
@@ -244,7 +245,8 @@ def read_rows(
             f"{path}: the rows of episodes are mixed, {label[0]:g} and {label[parts[0][1]]:g} in turn; all rows of an "
             "episode one below the other are right"
         )
-    return [replace(whole.part(start, end), number=float(label[start])) for start, end in parts]
+    episodes = [replace(whole.part(start, end), number=float(label[start])) for start, end in parts]
+    return [with_empty_cells(raw, system, note) for raw in episodes]
 
 
 def _number(cell: str) -> float:
@@ -266,8 +268,6 @@ def _complaint(cell: str) -> str:
     if not cell.isascii() and _is_number(cell.strip()):
         return f"is {cell!r}, with a space that is not ASCII; a plain number is right"
     cell = cell.strip()
-    if not cell:
-        return "is empty; a number is right (leave out rows without a measurement)"
     if _is_number(cell.replace(",", ".", 1)) and math.isfinite(float(cell.replace(",", ".", 1))):
         return f"is {cell!r}; a decimal point is right"
     return f"is {cell[:40]!r}; a number is right"

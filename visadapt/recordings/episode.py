@@ -100,7 +100,7 @@ class Recording:
     warnings: tuple[str, ...] = ()
     """what was changed or left out, a line each"""
     usable: tuple[NDArray[np.bool_], ...] = ()
-    """(T,) for each episode, which rows are measurements; without it, all are"""
+    """(T, n_measured) for each episode, which readings are measurements; without it, all are"""
     resolution: tuple[float, ...] = ()
     """smallest meaningful difference of each measured state; without it, the smallest between two of its readings"""
 

@@ -7,7 +7,6 @@ Left in, they would look like a push to whoever differentiates the positions.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +14,8 @@ from numpy.typing import NDArray
 from visadapt.recordings.clock import Note, RawEpisode
 from visadapt.recordings.episode import RecordingError
 from visadapt.recordings.runs import runs
-from visadapt.recordings.sensors import FROZEN_ROWS, TURN, differences, variable_of
+from visadapt.recordings.sensors import FROZEN_ROWS, differences, variable_of
+from visadapt.recordings.slow_sensors import with_usable
 from visadapt.systems import System
 
 OUTLIER_SCALES = 50.0
@@ -51,36 +51,38 @@ def without_outliers(raw: RawEpisode, system: System, note: Note) -> RawEpisode:
     if len(raw.time) < FROZEN_ROWS:
         return raw
     bad = np.zeros(len(raw.time), bool)
-    for name, values in raw.states.items():
+    for name in raw.measured:
         variable = variable_of(system, name)
         if variable.unit == "1":  # as a quaternion's, whose sign may change
             continue
+        rows = raw.read(name)
+        values = raw.states[name][rows]
         rate = system.rate_of(name)
         allowed = variable.largest
         if rate is not None:
-            allowed = min(allowed, 2 * float(np.median(np.diff(raw.time))) * variable_of(system, rate).largest)
+            allowed = min(allowed, 2 * float(np.median(np.diff(raw.time[rows]))) * variable_of(system, rate).largest)
         outliers = _outliers(differences(values, variable.unit == "rad"), values, allowed)
         if outliers.mean() > MOST_OUTLIERS:
-            row = int(outliers.argmax())
+            first = int(outliers.argmax())
             raise RecordingError(
-                f"{raw.cell(row, name)} is {values[row]:g}, far off the rows before and after, and "
+                f"{raw.cell(int(rows[first]), name)} is {values[first]:g}, far off the rows before and after, and "
                 f"{outliers.mean():.0%} of the column lie as far off: a sensor that follows the motion is right"
             )
-        for row in np.flatnonzero(outliers & ~bad).tolist():
+        for row in rows[outliers & ~bad[rows]].tolist():
             note(
                 "lies far off the rows before and after: an outlier; the row's readings were set aside",
-                f"{raw.cell(row, name)}: {values[row]:g}",
+                f"{raw.cell(row, name)}: {raw.states[name][row]:g}",
             )
-        bad |= outliers
+        bad[rows[outliers]] = True
         # An angle that stands still in places is an effect of the catalogue.
         if rate is not None and variable.unit != "rad":
-            for start, end in _stuck(raw, values):
+            for start, end in _stuck(raw.state[rows], values):
                 note(
                     f"{name} repeats a reading, then jumps: its sensor stuck; these rows' readings were set aside",
-                    f"{raw.cell(start, name)}, and {end - start - 1} rows after it",
+                    f"{raw.cell(int(rows[start]), name)}, and {end - start - 1} rows after it",
                 )
-                bad[start:end] = True
-    return _interpolated(raw, bad, system) if bad.any() else raw
+                bad[rows[start:end]] = True
+    return with_usable(raw, np.repeat(~bad[:, None], len(raw.measured), 1), system) if bad.any() else raw
 
 
 def _outliers(steps: NDArray[np.float64], values: NDArray[np.float64], allowed: float) -> NDArray[np.bool_]:
@@ -97,43 +99,27 @@ def _outliers(steps: NDArray[np.float64], values: NDArray[np.float64], allowed: 
     return bad
 
 
-def _stuck(raw: RawEpisode, values: NDArray[np.float64]) -> Iterator[tuple[int, int]]:
-    """First row, and the row after the last, of each run in which a sensor of `values` (T,) repeats an earlier one."""
+def _stuck(state: NDArray[np.float64], values: NDArray[np.float64]) -> Iterator[tuple[int, int]]:
+    """First row, and the row after the last, of each run in which a sensor of `values` (T,), one of those of `state`
+    (T, n_measured), repeats an earlier one."""
     steps = np.abs(np.diff(values))
     least = STUCK_STEPS * float(steps[steps > 0].min(initial=np.inf))
     for start, end in runs(values):
-        lost = (raw.state[start:end] == raw.state[start]).all()  # whole rows, which are an effect of the catalogue
+        lost = (state[start:end] == state[start]).all()  # whole rows, which are an effect of the catalogue
         if end - start < STUCK_ROWS or end + 1 >= len(values) or lost:
             continue
         if steps[end - 1] > max(least, STUCK_RATIO * steps[end]):
             yield start + 1, end
 
 
-def _interpolated(raw: RawEpisode, bad: NDArray[np.bool_], system: System) -> RawEpisode:
-    """The episode with the readings of `bad` rows (T,), neither the first nor the last, from those around."""
-    rows, kept, state = np.flatnonzero(bad), np.flatnonzero(~bad), raw.state.copy()
-    later = np.searchsorted(kept, rows)
-    before, after = kept[later - 1], kept[later]
-    share = (rows - before) / (after - before)
-    for column, name in enumerate(raw.measured):
-        values = raw.state[:, column]
-        step = values[after] - values[before]
-        if variable_of(system, name).unit == "rad":
-            step -= TURN * np.round(step / TURN)
-        state[rows, column] = values[before] + share * step
-    return replace(raw, state=state, usable=~bad)
-
-
 def jumps(raw: RawEpisode, system: System, note: Note) -> list[int]:
     """The rows from which on a position is suddenly elsewhere: its sensor lost count, or was moved."""
-    rows: set[int] = set()
-    lasting = np.diff(raw.time)
-    if len(lasting) < FROZEN_ROWS:
-        return []
+    out: set[int] = set()
     for name, values in raw.states.items():
-        if system.rate_of(name) is None:
+        rows = raw.read(name)
+        if system.rate_of(name) is None or len(rows) <= FROZEN_ROWS:
             continue
-        steps = np.diff(values)
+        lasting, steps = np.diff(raw.time[rows]), np.diff(values[rows])
         padded = np.pad(steps / lasting, AROUND_JUMP, mode="edge")
         others = np.delete(np.lib.stride_tricks.sliding_window_view(padded, 2 * AROUND_JUMP + 1), AROUND_JUMP, 1)
         nearest = others[:, AROUND_JUMP - 2 : AROUND_JUMP + 2].mean(1)
@@ -142,11 +128,12 @@ def jumps(raw: RawEpisode, system: System, note: Note) -> list[int]:
         usual = JUMP_SCALES * DEVIATION_PER_MEDIAN * float(np.median(size))
         jump = size > np.maximum(usual, JUMP_RATIO * lasting * np.abs(others).max(1))
         jump[1:] &= steps[:-1] != 0  # a sensor that stood still, which an effect of the catalogue does, then jumps
-        for row in (np.flatnonzero(jump[AROUND_JUMP:-AROUND_JUMP]) + AROUND_JUMP + 1).tolist():
+        for step in (np.flatnonzero(jump[AROUND_JUMP:-AROUND_JUMP]) + AROUND_JUMP).tolist():
+            row = int(rows[step + 1])
             note(
                 f"{name} is suddenly elsewhere and stays there: its sensor lost count, or was moved; the episode was "
                 "split",
-                f"{raw.cell(row, name)}, by {departs[row - 1]:.3g} {variable_of(system, name).unit}",
+                f"{raw.cell(row, name)}, by {departs[step]:.3g} {variable_of(system, name).unit}",
             )
-            rows.add(row)
-    return sorted(rows)
+            out.add(row)
+    return sorted(out)

@@ -32,6 +32,7 @@ from visadapt.recordings.hdf5 import read_names, read_stretches
 from visadapt.recordings.logs import read_log
 from visadapt.recordings.physics import is_in_newtons, same_after_a_turn
 from visadapt.recordings.sensors import TURN, check_sensors
+from visadapt.recordings.slow_sensors import without_held_readings
 from visadapt.recordings.thinning import thinned
 from visadapt.recordings.topics import reader
 from visadapt.systems import System
@@ -104,7 +105,7 @@ def load_recording(
             check_forward(raw)
         episodes = [without_bursts(raw, note) for raw in episodes]
         check_steps(episodes, system)
-        whole += [without_outliers(raw, system, note) for raw in episodes]
+        whole += [without_outliers(without_held_readings(raw, system, note), system, note) for raw in episodes]
     whole = [in_flight(raw, system, note) for raw in _commands(_shared(whole, system, note), system, note)]
     check_commands(whole, system, note)
     if not frames:
@@ -115,13 +116,15 @@ def load_recording(
     whole = [_unwrapped(raw, turning) for raw in whole]
     parts = [part for raw in whole for part in uninterrupted(raw, note, () if frames else jumps(raw, system, note))]
     parts, period = with_common_period(_long_enough(parts, system.prediction_time, note), note)
-    outliers = any(part.usable is not None for part in parts)
+    all_read = all(part.usable is None for part in parts)
     return Recording(
         episodes=tuple(Episode(part.time, part.action, None if frames else part.state, part.frame) for part in parts),
         measured=whole[0].measured,
         period=period,
         sources=tuple(part.origin for part in parts),
-        usable=tuple(np.ones(len(p.time), bool) if p.usable is None else p.usable for p in parts) if outliers else (),
+        usable=()
+        if all_read
+        else tuple(np.ones(part.state.shape, bool) if part.usable is None else part.usable for part in parts),
         warnings=tuple(
             f"{where[0]}{f' and {len(where) - 1} more' if len(where) > 1 else ''}: {text}"
             for text, where in notes.items()
@@ -251,10 +254,7 @@ def _shared(episodes: Sequence[RawEpisode], system: System, note: Note) -> list[
             shared.append(variable.name)
         elif len(without) < len(episodes):
             note(f"has no column {variable.name!r}, so that of the other files is not used", str(without[0]))
-    return [
-        replace(raw, measured=tuple(shared), state=raw.state[:, [raw.measured.index(name) for name in shared]])
-        for raw in episodes
-    ]
+    return [raw.of(shared) for raw in episodes]
 
 
 def _commands(episodes: list[RawEpisode], system: System, note: Note) -> list[RawEpisode]:

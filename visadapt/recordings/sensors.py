@@ -6,7 +6,6 @@ Values that cannot have been measured must not be diagnosed: the diagnosis would
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import groupby
 
 import numpy as np
@@ -81,8 +80,7 @@ def check_sensors(episodes: Sequence[RawEpisode], system: System, note: Note) ->
                 )
             note(f"{name} never changes although its position does: a dead sensor; it was left out", str(file[0].path))
             dead.add(name)
-    kept = [column for column, name in enumerate(measured) if name not in dead]
-    return [replace(raw, measured=tuple(measured[k] for k in kept), state=raw.state[:, kept]) for raw in episodes]
+    return [raw.of([name for name in measured if name not in dead]) for raw in episodes]
 
 
 def _is_still(values: NDArray[np.float64], system: System, name: str) -> bool:

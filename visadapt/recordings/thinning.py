@@ -43,7 +43,7 @@ def spread(recording: Recording, most: int, length: int, before: int) -> Recordi
         stretches += [(number, slice(*pair)) for pair in pairwise(edges)]
     count = max(1, most * len(stretches) // sum(rows))
     chosen = [stretches[k] for k in np.linspace(0, len(stretches) - 1, count).round().astype(int)]
-    every = recording.usable or [np.ones(own, bool) for own in rows]
+    every = recording.usable or [np.ones((own, len(recording.measured)), bool) for own in rows]
     episodes, sources, usable = [], [], []
     for number, own in chosen:
         episode, led = recording.episodes[number], slice(max(0, own.start - before), own.stop)
@@ -51,7 +51,7 @@ def spread(recording: Recording, most: int, length: int, before: int) -> Recordi
         time, action, state = episode.time[led], episode.action[led], episode.state[led]
         episodes.append(replace(episode, time=time, action=action, state=state, task_state=None))
         sources.append(f"{recording.sources[number]}{FROM}{episode.time[own.start]:.1f} s")
-        usable.append(every[number][led] & (np.arange(led.start, led.stop) >= own.start))
+        usable.append(every[number][led] & (np.arange(led.start, led.stop) >= own.start)[:, None])
     used = sum(own.stop - own.start for _, own in chosen)
     return replace(
         recording,

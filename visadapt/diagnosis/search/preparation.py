@@ -59,6 +59,9 @@ EARLIER_LOG_ODDS = 20.0
 MOST_FILLED = 2
 """Rows in a row whose readings are filled in by cubics: the acceleration in more of them would be made up."""
 
+LEAST_READ = 0.8
+"""Share of the rows in which a sensor is read, below which it gives the rows in which pushes are looked for."""
+
 MEMORY = 2.0
 """Prediction times before a stretch of rows whose commands are used too: what is late, or lags, remembers them."""
 
@@ -140,18 +143,27 @@ class _Readings:
 
     def whole(self, convention: Convention | None) -> Recording:
         """Episodes from their first usable row on, in the signs of the source. Repeated and missing readings are filled
-        in; rows of longer runs of these are marked as not usable."""
+        in; rows of longer runs of these are marked as not usable. Rows between the readings of a sensor slower than the
+        rows are left out: a command is its mean until the next row."""
         convention = convention or Convention("", ())
         sign = sign_conventions.signs(convention.columns, self.channels)
         command_sign = sign_conventions.signs(convention.commands, range(len(self.system.actions)))
+        share = torch.cat(self.usable).mean(0)
+        slowest = None if float(share.min()) > LEAST_READ else int(share.argmin())
         parts = zip(self.stamps, self.commands, self.states, self.repeats.used, strict=True)
         episodes, usable = [], []
         for rows, first in zip(parts, self.first_usable, strict=True):
             time, command, state, used = (values[first:] for values in rows)
-            action, filled = (command_sign * command).numpy(), (sign * smoothly_filled(state, used, time)).numpy()
-            episodes.append(Episode(time.numpy(), action, filled))
-            usable.append(_without_long_runs((used > 0).all(1).numpy()))
-        return replace(self.recording, episodes=tuple(episodes), usable=tuple(usable))
+            action, filled = command_sign * command, sign * smoothly_filled(state, used, time)
+            kept = _without_long_runs((used > 0).all(1).numpy())
+            if slowest is not None:
+                read = used[:, slowest].nonzero()[:, 0]
+                time, action, filled = time[read], means_until_next(action, time, read), filled[read]
+                kept = np.ones(len(read), bool)
+            episodes.append(Episode(time.numpy(), action.numpy(), filled.numpy()))
+            usable.append(np.repeat(kept[:, None], len(self.channels), 1))
+        period = float(torch.cat([torch.from_numpy(episode.time).diff() for episode in episodes]).median())
+        return replace(self.recording, episodes=tuple(episodes), usable=tuple(usable), period=period)
 
 
 def _with_unmeasured(rows: Segments, raw: Segments, system: System) -> tuple[Segments, Segments]:
@@ -212,12 +224,13 @@ def _read(recording: Recording, system: System, pushes: Sequence[Push]) -> _Draf
         values[:, quaternion] = continuous_quaternion(values[:, quaternion])
     commands = [torch.tensor(np.asarray(e.action, dtype=np.float64)) for e in recording.episodes]
     stamps = [torch.tensor(np.asarray(e.time, dtype=np.float64)) for e in recording.episodes]
-    repeats = find_repeats(states, channels, profile.angle_sensor)
     usable = [torch.ones_like(values) for values in states]
     if recording.usable:
-        usable = [every * torch.tensor(rows)[:, None] for every, rows in zip(usable, recording.usable, strict=True)]
+        usable = [torch.tensor(read).double() for read in recording.usable]
+    repeats = find_repeats(states, channels, profile.angle_sensor, usable)
+    if recording.usable:
         used = [a * b for a, b in zip(repeats.used, usable, strict=True)]
-        seen = [torch.tensor(kept) for kept in recording.usable]
+        seen = [read.any(1) for read in usable]
         lost = [rows & kept for rows, kept in zip(repeats.lost, seen, strict=True)]
         repeats = replace(repeats, used=used, lost=lost, seen=seen)
     pushed = pushed_rows(pushes, stamps, system)
@@ -315,6 +328,14 @@ def _a_row_earlier(command: Tensor, dim: int) -> Tensor:
     """Commands whose rows along a dimension are one earlier; the last stays."""
     count = command.shape[dim]
     return command.index_select(dim, torch.arange(1, count + 1).clamp(max=count - 1))
+
+
+def means_until_next(command: Tensor, stamps: Tensor, rows: Tensor) -> Tensor:
+    """(R, n) of commands (T, n) at stamps (T,), the mean over time from each of some `rows` (R,) until the next."""
+    held = torch.diff(stamps, append=stamps[-1:])
+    total = torch.cat((torch.zeros_like(command[:1]), (held[:, None] * command).cumsum(0)))
+    means = total[rows].diff(dim=0) / stamps[rows].diff()[:, None]
+    return torch.cat((means, command[rows[-1:]]))
 
 
 def _evenly_spaced(stamps: Tensor) -> Tensor:

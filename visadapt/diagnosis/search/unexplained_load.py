@@ -95,7 +95,7 @@ def load_tracks(recording: Recording, worlds: Sequence[World], known: SmoothFunc
     found = [
         part
         for number, episode in enumerate(recording.episodes)
-        for stretch in _measured(episode, recording.usable[number] if recording.usable else None)
+        for stretch in _measured(episode, recording.usable[number].all(1) if recording.usable else None)
         for part in _track(number, stretch, worlds[number], measured, recording.period, known)
     ]
     if not found:

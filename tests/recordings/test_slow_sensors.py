@@ -1,0 +1,109 @@
+"""Sensors slower than the rows: what a table repeats, or leaves empty, between two readings is not used as one."""
+
+import numpy as np
+import pytest
+
+from tests.recorded import a_run, load, refuses, write
+from visadapt.diagnosis import diagnose
+from visadapt.effects import Dropout, FrozenZone, PositionDelay, ViscousFriction
+from visadapt.systems import CartPole
+from visadapt.world import World
+
+ROWS = 400
+EVERY_4 = np.arange(ROWS) % 4 == 0
+OF_60_HZ = np.diff(np.floor(0.6 * np.arange(ROWS + 1) + 0.5), prepend=-1)[:-1] > 0  # in rows of 100 Hz
+POSITIONS_ALONE = {"x_dot": "", "theta_dot": ""}
+
+
+@pytest.fixture(scope="module")
+def run():
+    return a_run(0.1, 1e-3, rows=ROWS, period=0.02)
+
+
+def held(values, fresh):
+    return np.asarray(values)[np.maximum.accumulate(np.where(fresh, np.arange(len(fresh)), 0))]
+
+
+def with_empty(values, empty):
+    return ["" if missing else str(value) for value, missing in zip(values, empty, strict=True)]
+
+
+def usable(recording, name):
+    (read,) = recording.usable
+    return read[:, recording.measured.index(name)]
+
+
+@pytest.mark.parametrize("fresh", [EVERY_4, OF_60_HZ], ids=["every 4th row", "60 Hz in rows of 100 Hz"])
+@pytest.mark.parametrize("empty", [False, True], ids=["held", "empty cells"])
+def test_only_readings_are_used_and_the_others_lie_between(file, run, fresh, empty):
+    x = with_empty(run["x"], ~fresh) if empty else held(run["x"], fresh)
+    recording = load(write(file, {**run, "x": x}), columns=POSITIONS_ALONE)
+    np.testing.assert_array_equal(usable(recording, "x"), fresh)
+    assert usable(recording, "theta").all()
+    between = np.interp(run["time"], run["time"][fresh], run["x"][fresh])
+    np.testing.assert_allclose(recording.episodes[0].state[:, 0], between)
+    (said,) = (one for one in recording.warnings if "not measured" not in one)
+    share = f"{fresh.mean():.0%}"
+    assert (f"x: read in the rows in which cells are not empty, {share} of all" in said) == empty
+
+
+@pytest.mark.parametrize("share", [0.1, 0.3, 0.7])
+def test_rows_that_are_lost_at_random_are_no_slow_sensor(file, run, share):
+    fresh = np.random.default_rng(0).uniform(size=ROWS) > share
+    lost = {name: held(run[name], fresh) for name in ("x", "theta")}
+    assert not load(write(file, {**run, **lost}), columns=POSITIONS_ALONE).usable
+
+
+def of_a_cart_that_rests(step):
+    return np.round(0.3 * np.sin(3 * np.minimum(0.02 * np.arange(ROWS), 6)) / step) * step
+
+
+def test_an_encoder_that_rests_is_read_there_too(file, run):
+    x = of_a_cart_that_rests(1e-3)
+    assert not load(write(file, {**run, "x": x}), columns=POSITIONS_ALONE).usable
+    read = usable(load(write(file, {**run, "x": held(x, EVERY_4)}), columns=POSITIONS_ALONE), "x")
+    assert read[320:].sum() == pytest.approx(20, abs=1)
+    assert (read[:300] <= EVERY_4[:300]).all()
+
+
+def test_rates_that_were_derived_from_what_is_held_are_left_out(file, run):
+    x, theta = held(run["x"], EVERY_4), held(run["theta"], EVERY_4)
+    derived = {"x": x, "x_dot": np.gradient(x, 0.02), "theta": theta, "theta_dot": np.diff(theta, prepend=0.1) / 0.02}
+    recording = load(write(file, {**run, **derived}))
+    assert recording.measured == ("x", "theta")
+    assert sum("derived on the rig" in said for said in recording.warnings) == 2
+    slow = {"x": x, "theta": theta}  # with rates from sensors of their own
+    assert len(load(write(file, {**run, **slow})).measured) == 4
+
+
+def test_commands_hold_until_the_next(file, run):
+    given = np.arange(ROWS) % 5 == 3
+    recording = load(write(file, {**run, "command": with_empty(run["command"], ~given)}))
+    (episode,) = recording.episodes
+    np.testing.assert_allclose(episode.action[:, 0], held(run["command"], given)[3:])
+    assert any("3 rows before the first command are left out" in said for said in recording.warnings)
+
+
+def test_an_outlier_of_a_slow_sensor_is_set_aside(file, run):
+    x = np.array(run["x"])
+    x[80] = 9.0
+    assert not usable(load(write(file, {**run, "x": held(x, EVERY_4)}), columns=POSITIONS_ALONE), "x")[80:84].any()
+
+
+def test_a_slow_sensor_that_is_suddenly_elsewhere_splits_the_episode(file, run):
+    x = np.array(run["x"]) + 0.3 * (np.arange(ROWS) >= 200)
+    recording = load(write(file, {**run, "x": held(x, EVERY_4)}), columns=POSITIONS_ALONE)
+    assert [len(episode.time) for episode in recording.episodes] == [200, 200]
+
+
+def test_a_few_empty_cells_are_refused(file, run):
+    empty = np.isin(np.arange(ROWS), [30, 40])
+    refuses(r"row 31 \(line 32\), column 'x' is empty or nan", write(file, {**run, "x": with_empty(run["x"], empty)}))
+
+
+@pytest.mark.parametrize("slow", [("x",), ("theta",), ("x", "theta")])
+def test_what_is_held_is_no_effect(file, run, slow):
+    table = {**run, **{name: held(run[name], EVERY_4) for name in slow}}
+    recording = load(write(file, table), columns=POSITIONS_ALONE)
+    found = diagnose(recording, World(CartPole()), [Dropout, FrozenZone, PositionDelay, ViscousFriction])
+    assert (found.verdict, found.causes) == ("no_gap", ())
