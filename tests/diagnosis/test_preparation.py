@@ -42,13 +42,15 @@ def test_lost_rows_are_counted_among_those_that_may_be_used():
         state, kept = episode.state.copy(), generator.random(100) < 0.6
         for row in np.flatnonzero(generator.random(100) < 0.15):
             state[row] = state[row - 1] if row else state[row]
-            lost += bool(row and kept[row])
+            lost += bool(row and kept[row] and kept[row - 1])
         episodes.append(Episode(episode.time, episode.action, state))
-        usable.append(kept)
+        usable.append(np.repeat(kept[:, None], 2, 1))
     whole = dataclasses.replace(record(episodes=4, rows=100), episodes=tuple(episodes), usable=tuple(usable))
     repeats = prepare(whole, CartPole()).repeats
     assert sum(int(rows.sum()) for rows in repeats.lost) == lost
-    assert sum(int(rows[1:].sum()) for rows in repeats.seen) == sum(rows[1:].sum() for rows in usable)
+    assert sum(int(rows[1:].sum()) for rows in repeats.seen) == sum(
+        (read[1:] & read[:-1])[:, 0].sum() for read in usable
+    )
 
 
 def with_filtered_velocities(recording):

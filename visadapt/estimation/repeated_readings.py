@@ -43,7 +43,7 @@ class RepeatedReadings:
 
     used: list[Tensor]  # (T, m) 1 where a reading is a measurement
     lost: list[Tensor]  # (T,) whether the whole row is repeated
-    seen: list[Tensor]  # (T,) whether the row may be used, so that its loss would be seen
+    seen: list[Tensor]  # (T,) whether the row and the one before may be used, so that its loss would be seen
     frozen: list[Tensor]  # (T,) whether the angle is repeated and the rest of the row is not
     silent: list[Tensor]  # (T,) whether a row tells nothing of the angles at which the sensor stands still
 
@@ -66,15 +66,15 @@ def find_repeats(
     by_chance = [_equal_by_chance(changes[:, k], step) for k, step in enumerate(steps)]
     of_angle = torch.tensor([c in angle_sensor for c in channels], dtype=torch.bool)
     angle = channels.index(angle_sensor[0]) if angle_sensor and angle_sensor[0] in channels else None
-    read_twice = [_also_before(read > 0) for read in usable]
+    both = [read_twice(read) for read in usable]
     same = [
         torch.stack([_repeats(values[:, k], steps[k]) for k in range(len(channels))], 1) & twice
-        for values, twice in zip(measured, read_twice, strict=True)
+        for values, twice in zip(measured, both, strict=True)
     ]
     resting = [_resting(values, torch.tensor(steps).to(values)) for values in measured]
     whole_rows = [
         (_equal(values) | ~twice).all(1) & each.any(1) & ~rest
-        for values, twice, each, rest in zip(measured, read_twice, same, resting, strict=True)
+        for values, twice, each, rest in zip(measured, both, same, resting, strict=True)
     ]
     lost = _unless_by_chance(whole_rows, min(by_chance))
     # A rate from a separate sensor may go on while the angle stands still.
@@ -84,7 +84,7 @@ def find_repeats(
         frozen = _unless_by_chance(alone, by_chance[angle])
         if any(bool(still.any()) for still in frozen):
             # What a sensor slower than the rows might have shown in a row is unknown.
-            unknown = [row & ~twice.all(1) for row, twice in zip(lost, read_twice, strict=True)]
+            unknown = [row & ~twice.all(1) for row, twice in zip(lost, both, strict=True)]
             frozen = [still | row for still, row in zip(frozen, unknown, strict=True)]
             lost = [row & ~other for row, other in zip(lost, unknown, strict=True)]
     used = []
@@ -117,8 +117,9 @@ def _equal(values: Tensor) -> Tensor:
     return torch.cat((torch.zeros_like(values[:1], dtype=torch.bool), values.diff(dim=0) == 0))
 
 
-def _also_before(read: Tensor) -> Tensor:
-    """Which of the values (T, m) were `read`, and those of the row before too."""
+def read_twice(usable: Tensor) -> Tensor:
+    """Which of the `usable` (T, m) readings, those above 0, follow one of the row before, which they may repeat."""
+    read = usable > 0
     return torch.cat((torch.zeros_like(read[:1]), read[1:] & read[:-1]))
 
 

@@ -114,6 +114,9 @@ class Recording:
                 raise RecordingError(
                     f"episode {number} has {columns}; one for each of {names}, the measured ones, is right"
                 )
+        for number, (episode, usable) in enumerate(zip(self.episodes, self.usable, strict=bool(self.usable))):
+            if usable.shape != (right := (len(episode.time), len(self.measured))):
+                raise RecordingError(f"usable of episode {number} has the shape {usable.shape}; {right} is right")
 
     @property
     def samples(self) -> int:

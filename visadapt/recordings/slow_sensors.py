@@ -53,8 +53,8 @@ def without_held_readings(raw: RawEpisode, system: System, note: Note) -> RawEpi
         told.setdefault(f"{1 / fresh.mean():.2g} rows ({interval:.2g} s)", []).append(name)
     for every, names in told.items():
         note(
-            f"{', '.join(names)}: read about every {every} and held in between: only new readings are used, which may be "
-            "late by up to a row",
+            f"{', '.join(names)}: read about every {every} and held in between: only new readings are used, which may "
+            "be late by up to a row",
             raw.origin,
         )
     return with_usable(raw, usable, system)
@@ -75,7 +75,7 @@ def with_empty_cells(raw: RawEpisode, system: System, note: Note) -> RawEpisode:
     empty = np.isnan(raw.action)
     sparse = empty.mean(0) > LEAST_EMPTY
     if sparse.any():
-        first = int((~empty[:, sparse]).all(1).argmax())
+        first = int((~empty[:, sparse]).argmax(0).max())
         raw, empty = raw.part(first, len(raw.time)), empty[first:]
         action = raw.action.copy()
         for column in np.flatnonzero(sparse):

@@ -19,7 +19,7 @@ from visadapt.effects import Effect
 from visadapt.estimation.integration_step import with_longest_step
 from visadapt.estimation.likelihood import FitState
 from visadapt.estimation.profiles import Convention, profile_of
-from visadapt.estimation.repeated_readings import RepeatedReadings, find_repeats
+from visadapt.estimation.repeated_readings import RepeatedReadings, find_repeats, read_twice
 from visadapt.estimation.segments import Segments, Stretch, cut, smoothly_filled, stretches_without
 from visadapt.estimation.unmeasured_states import with_unmeasured
 from visadapt.recordings import Episode, Recording
@@ -230,7 +230,7 @@ def _read(recording: Recording, system: System, pushes: Sequence[Push]) -> _Draf
     repeats = find_repeats(states, channels, profile.angle_sensor, usable)
     if recording.usable:
         used = [a * b for a, b in zip(repeats.used, usable, strict=True)]
-        seen = [read.any(1) for read in usable]
+        seen = [read_twice(read).any(1) for read in usable]
         lost = [rows & kept for rows, kept in zip(repeats.lost, seen, strict=True)]
         repeats = replace(repeats, used=used, lost=lost, seen=seen)
     pushed = pushed_rows(pushes, stamps, system)

@@ -95,7 +95,7 @@ def load_tracks(recording: Recording, worlds: Sequence[World], known: SmoothFunc
     found = [
         part
         for number, episode in enumerate(recording.episodes)
-        for stretch in _measured(episode, recording.usable[number].all(1) if recording.usable else None)
+        for stretch in _measured(episode, recording.usable[number] if recording.usable else None)
         for part in _track(number, stretch, worlds[number], measured, recording.period, known)
     ]
     if not found:
@@ -145,12 +145,13 @@ def _usual_size(load: Tensor) -> Tensor:
 
 
 def _measured(episode: Episode, usable: NDArray[np.bool_] | None) -> Iterator[Episode]:
-    """The stretches of an episode whose rows are `usable` (T,); None: the whole episode."""
+    """The stretches of an episode whose readings (T, m) are `usable`; None: the whole episode."""
     if usable is None or usable.all():
         yield episode
         return
-    for start, end in runs(usable):
-        if usable[start] and end - start > 1:
+    whole = np.logical_and.reduce(usable, axis=1)
+    for start, end in runs(whole):
+        if whole[start] and end - start > 1:
             rows = slice(start, end)
             assert episode.state is not None
             yield Episode(episode.time[rows], episode.action[rows], episode.state[rows])
