@@ -152,7 +152,7 @@ def test_a_policy_of_another_period_is_neither_scored_nor_filmed(tmp_path):
 
 
 def test_a_target_without_states_has_no_score():
-    with pytest.raises(ValueError, match="seen: shows no cart speed; a score needs it"):
+    with pytest.raises(ValueError, match="seen: shows no states of a cart-pole; a score is that of the cart's speed"):
         score(Blind(), Seen(columns=0), episodes=1, steps=2)
 
 

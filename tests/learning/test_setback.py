@@ -1,15 +1,18 @@
 """A tuned policy that does much worse on the machine than the one it began as is not kept."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 import visadapt as va
 from visadapt.effects import ActuatorDelay
 from visadapt.learning.setback import Performance, setback
 from visadapt.recordings import Episode
 from visadapt.tasks.balance import PAPER_CARTPOLE, Balance
+from visadapt.tasks.reach import Reach
 
 WELL = Performance(40, 0, 1.0)
 
@@ -51,6 +54,15 @@ def test_episodes_that_end_early_and_the_cost_of_the_others():
     assert faster.cost > found.cost > 0
     assert math.isnan(Performance.of([still(6, 1.0)], 20, task).cost)
     assert math.isnan(Performance.of([still(13, 1.0)], 20, None).cost)
+
+
+def test_of_a_machine_that_keeps_its_task_to_itself_no_cost_is_known():
+    """A vehicle whose target shows goals alone: how far it is in its task is not recorded."""
+    state = np.tile(np.eye(1, 13, 6), (20, 1))
+    flown = Episode(0.05 * np.arange(20), np.zeros((20, 4)), state)
+    assert math.isnan(Performance.of([flown], 20, Reach()).cost)
+    goals = Reach().training_start(1, 1.0, torch.Generator().manual_seed(0))[1].expand(20, -1).numpy().astype(float)
+    assert Performance.of([replace(flown, task_state=goals)], 20, Reach()).cost > 0
 
 
 def test_under_a_late_motor_the_policy_stays_what_it_was(tmp_path):

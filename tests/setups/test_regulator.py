@@ -168,3 +168,13 @@ def test_what_a_task_does_not_go_with_is_refused(trained):
         va.train(world, task=TASK, with_history=True)
     with pytest.raises(ValueError, match=r"torque of a pendulum ranges from -2 to 2 N m, the commands of the policy"):
         replace(regulator(world, TASK), policy=lambda: StatePolicy(2))
+
+
+def test_a_policy_tuned_for_a_sensor_that_is_off_is_kept_though_its_readings_look_worse(trained):
+    source = va.World(Pendulum(), period=PERIOD)
+    target = va.RegulationTarget(TASK, PERIOD, lambda *_: [OWN["angle.sensor_offset"](offset=0.08)])
+    found = va.adapt(trained, source, target, samples=200, round_samples=100, iterations=60, diagnose=True)
+    assert [effect.name for effect in found.source.effects] == ["angle.sensor_offset"]
+    assert found.taken_back == ""
+    read = va.score(found.policy, target, episodes=2).errors["angle"]
+    assert read == pytest.approx(0.08, abs=0.005)  # at its goal, the machine is read off it

@@ -178,3 +178,34 @@ def test_a_file_that_says_no_task_is_refused(text, line, tmp_path):
     path.write_text(text)
     with pytest.raises(TaskFileError, match=f"task.toml: {line}"):
         va.read_task(path, Pendulum())
+
+
+def with_effects(**named):
+    """The pendulum's world with effects, by their names, each with one parameter: {name: {parameter: value}}."""
+    effects = {effect.name: effect for effect in va.catalogue(Pendulum())}
+    return va.World(Pendulum(), [effects[name](**values) for name, values in named.items()], period=0.02)
+
+
+def to_go(task):
+    return torch.tensor(task.to_go).numpy()
+
+
+def test_where_effects_act_the_task_is_that_of_their_physics():
+    found = TILTED.in_world(with_effects(**{"inertia.scale": {"scale": 1.5}, "moment.scale": {"scale": 1.3}}))
+    there = Pendulum(inertia=1.5 * 0.05, moment=1.3 * 0.1)
+    as_parameters = replace(TILTED, system=there).in_world(va.World(there, period=0.02))
+    assert found.held.tolist() == pytest.approx([1.3 * TILTED.held.item()], rel=1e-6)
+    assert to_go(found) == pytest.approx(to_go(as_parameters), rel=1e-5)
+    bare = TILTED.in_world(with_effects())
+    assert bare.held.tolist() == TILTED.held.tolist()
+    damped = TILTED.in_world(with_effects(**{"joint.viscous_friction": {"coefficient": 0.1}}))
+    assert to_go(damped)[1, 1] < 0.95 * to_go(bare)[1, 1]
+
+
+def test_effects_that_jump_at_rest_leave_the_cost_to_go():
+    rubbing = with_effects(**{"joint.coulomb_friction": {"torque": 0.2}})
+    assert to_go(TILTED.in_world(rubbing)) == pytest.approx(to_go(TILTED.in_world(with_effects())), rel=1e-9)
+
+
+def test_a_goal_that_effects_leave_no_command_for_stays_as_it_was():
+    assert TILTED.in_world(with_effects(**{"moment.scale": {"scale": 5.0}})) is TILTED

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import copy
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -19,9 +20,16 @@ from visadapt.effects import Effect, Parameter
 from visadapt.learning.explanation import Explanation
 from visadapt.policies import ImagePolicy
 from visadapt.setups.explained import check_diagnosable
+from visadapt.setups.policy_file import save_policy
 from visadapt.setups.training import adapt, setup_to_adapt
 from visadapt.storage.run_folder import alone_in, open_run, write_json
 from visadapt.tasks.references import read_reference
+
+LATE = (
+    ". A residual on the last state alone cannot learn a motor that is late: --diagnose names it, and with "
+    "--with-history earlier periods are seen"
+)
+"""What may help where a policy tuned with a residual is worse."""
 
 
 def run(options: argparse.Namespace) -> None:
@@ -60,10 +68,13 @@ def run(options: argparse.Namespace) -> None:
         for warning in last.warnings:
             print(f"Warning    {warning}")
     if adapted.taken_back:
+        tuned = copy.deepcopy(adapted.policy)
+        adapted.restore(tuned, adapted.rounds[-1].samples)
+        save_policy(folder / "tuned.safetensors", tuned)
+        hint = "" if options.diagnose else LATE
         print(
-            f"The policy is the one that it began as, since the tuned one was worse: {adapted.taken_back}. A residual "
-            "on the last state alone cannot learn a motor that is late: --diagnose names it, and with --with-history "
-            "earlier periods are seen"
+            f"The policy is the one that it began as, since the tuned one, {folder / 'tuned.safetensors'}, was worse: "
+            f"{adapted.taken_back}{hint}"
         )
     print(f"{adapted.ledger.used} samples of {target.name} used; the policy is {folder / 'policy.safetensors'}")
 

@@ -97,8 +97,8 @@ def score(
     """Run `policy` for `episodes` episodes on `target`: how well it does, and how many episodes failed.
 
     Flights are scored by the errors in m that their task defines (`FlightTask.misses`), cart-poles by the cart's speed
-    in m/s, and systems with a `Regulate` task by their distances from its goal. The steps are those of an evaluation:
-    no ledger counts them.
+    in m/s, and systems with a `Regulate` task by their distances from its goal; all by what the target shows as its
+    state, so that a sensor that is off shows in them. The steps are those of an evaluation: no ledger counts them.
 
     Args:
         seed: of the starts and of the hidden effects.
@@ -136,8 +136,11 @@ def score(
         raise ValueError(f"a score is that of a cart's speed or of a flight; {target.name} is a {kind.name}: use run")
     runs = run(target, policy, episodes, steps or EPISODE_STEPS, generator, keep_frames=False)
     state = runs[0].episode.state
-    if state is None or state.shape[1] < 2:
-        raise ValueError(f"{target.name}: shows no cart speed; a score needs it, as the second of the states")
+    if state is None or state.shape[1] != len(CartPole.states):
+        raise ValueError(
+            f"{target.name}: shows no states of a cart-pole; a score is that of the cart's speed, the second of these: "
+            "of another machine use run"
+        )
     return score_runs(runs)
 
 

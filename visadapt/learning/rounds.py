@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from visadapt.effects import Residual
+from visadapt.effects import Residual, SensingEffect
 from visadapt.learning.explanation import NOT_DIAGNOSED, Explain, Explanation
 from visadapt.learning.feedforward import initialise_feedforward
 from visadapt.learning.grounding import GroundLoss, fit_named, ground, rescale
@@ -201,11 +201,12 @@ class JointLearning:
         if self.explorer is not None:
             return ""
         # Of a flight, the target's own task, whose references may be others than those that tuning takes; of frames
-        # none, since the target's states are not for a policy that sees frames.
+        # none, since the target's states are not for a policy that sees frames; nor where sensors are found to be
+        # wrong, since a policy that allows for it does well where its readings do not show it.
         task: Task | None = self.settings.tuning.task
         if isinstance(self.target, FlightTarget):
             task = self.target.task
-        elif self.observe is not None:
+        elif self.observe is not None or any(isinstance(effect, SensingEffect) for effect in self.found.effects):
             task = None
         longest = self.settings.longest_episode
         why = setback([Performance.of(each, longest, task) for each in self._collected])
@@ -245,10 +246,11 @@ class JointLearning:
     def _fit_residual(self, folder: RoundFolder, transitions: Transitions) -> list[GroundLoss]:
         """Fit the residual, again with the next larger ridge where the policy is unstable in the world with it."""
         self._begin_tuning()
-        world = self._grounded_world
+        world, settings = self._grounded_world, self.settings.tuning
+        settings = replace(settings, task=settings.task.in_world(world))
 
         def accept() -> bool:
-            return stable(self._plan_costs(folder, world, self.settings.tuning, transitions))
+            return stable(self._plan_costs(folder, world, settings, transitions))
 
         generator, progress = folder.generator(GROUNDING), self._progress(folder, "ground")
         return ground(self.residual, self.known, transitions, self.settings.ground, generator, progress, accept)
@@ -312,7 +314,7 @@ class JointLearning:
         self, folder: RoundFolder, world: World, settings: TuneSettings, transitions: Transitions | None = None
     ) -> list[float]:
         """Tune the policy in `world`, or give it the weights of a round that was tuned before; the losses."""
-        path = folder.policy
+        path, settings = folder.policy, replace(settings, task=settings.task.in_world(world))
         if not path.exists():
             unfinished = path.with_suffix(".partial.safetensors")
             losses = self._improve(folder, world, settings, transitions, unfinished) if settings.iterations else []

@@ -54,11 +54,12 @@ def _costs(episode: Episode, task: Task) -> np.ndarray:
         return np.zeros(0)
     dtype = torch.get_default_dtype()
     state, action = (torch.as_tensor(each, dtype=dtype) for each in (episode.state, episode.action))
-    task_state = state[:, :0]
-    if episode.task_state is not None:
-        # As the task makes them: those of a reference are whole numbers, which a recording does not know.
-        like = task.training_start(1, 1.0, torch.Generator().manual_seed(0))[1]
-        task_state = torch.as_tensor(episode.task_state).to(like)
+    # As the task makes them: those of a reference are whole numbers, which a recording does not know.
+    like = task.training_start(1, 1.0, torch.Generator().manual_seed(0))[1]
+    known = state[:, :0] if episode.task_state is None else torch.as_tensor(episode.task_state)
+    if known.shape[1] != like.shape[1]:  # of a machine that shows a policy its goal, and no other
+        return np.zeros(0)
+    task_state = known.to(like)
     ahead = state[1:].unfold(0, HORIZON, 1).movedim(-1, 1)[:count]
     plan = action.unfold(0, HORIZON, 1).movedim(-1, 1)[:count]
     return task.to(state).cost(ahead, plan, state[:count], task_state[:count])[count // 2 :].numpy()

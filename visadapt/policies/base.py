@@ -123,7 +123,8 @@ class AutoregressivePolicy(Policy):
 def check_policy(given: object) -> None:
     """Raises TypeError where something else is given in the place of a policy: its file, say, or a run that made it."""
     if not isinstance(given, Policy):
-        right = "load_policy reads a file" if isinstance(given, str | os.PathLike) else "a run has one as its .policy"
+        made = "one that visadapt.train makes is right; a run has one as its .policy"
+        right = "load_policy reads a file" if isinstance(given, str | os.PathLike) else made
         raise TypeError(f"a {type(given).__name__} is no policy: {right}")
 
 

@@ -32,6 +32,8 @@ LEAST_ROWS = 8
 """Rows of an episode below which its units are not judged."""
 MOST_RATE_RANGES = 3.0
 """Rates above this multiple of the system's stated range are taken to be in another unit."""
+COMMAND_ROUNDING = 1e-6
+"""Share of its range by which a command may lie outside: single precision does not hold every bound."""
 SMALL_COMMAND = 0.01
 """Share of its range within which a command that stays there is asked about."""
 SURE_OF_DEGREES = 0.023
@@ -61,7 +63,8 @@ def check_commands(episodes: Sequence[RawEpisode], system: System, note: Note) -
     """
     for column, variable in enumerate(system.actions):
         every = np.concatenate([raw.action[:, column] for raw in episodes])
-        share = float(((every < variable.low) | (every > variable.high)).mean())
+        rounding = COMMAND_ROUNDING * (variable.high - variable.low)
+        share = float(((every < variable.low - rounding) | (every > variable.high + rounding)).mean())
         if share == 0:
             if 0 < np.abs(every).max() < SMALL_COMMAND * max(-variable.low, variable.high):
                 unit = "" if variable.unit == "1" else f" {variable.unit}"

@@ -43,6 +43,9 @@ KINDS: dict[str, type[Policy]] = {
     kind.__name__: kind for kind in (ImagePolicy, StatePolicy, FollowPolicy, ReachPolicy, RegulatorPolicy)
 }
 
+OF_OTHERS = (".onnx", ".pt", ".pth", ".ts", ".zip", ".pkl")
+"""Suffixes of policies of other libraries."""
+
 
 def save_policy(path: str | Path, policy: Policy, about: Mapping[str, Any] | None = None) -> None:
     """Write a policy, and its residual if it has one, to a safetensors file; `about` is kept with it.
@@ -75,6 +78,11 @@ def load_policy(path: str | Path) -> Policy:
     (4, 1, 'state')
     """
     path = Path(path)
+    if path.suffix.lower() in OF_OTHERS:
+        raise CheckpointError(
+            f"{path}: a network of another library, which no simulator was differentiated through; a policy that "
+            "`visadapt train` makes for the system is right"
+        )
     tree = _load(path)
     if tree["class"] not in KINDS:
         raise CheckpointError(

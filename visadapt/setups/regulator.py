@@ -18,7 +18,7 @@ from visadapt.recordings.physics import same_after_a_turn
 from visadapt.setups.base import Setup
 from visadapt.setups.policy_file import residual_for
 from visadapt.systems import System
-from visadapt.tasks.linear_quadratic import Regulator, linear_quadratic
+from visadapt.tasks.linear_quadratic import Regulator
 from visadapt.tasks.regulate import Regulate
 from visadapt.world import World
 
@@ -30,11 +30,11 @@ NEARLY = 0.999  # Largest share of a command's range that the policy holds at th
 def regulator(source: World, task: Regulate) -> Setup:
     """A system that is brought to rest at the goal of its task.
 
-    The policy begins as the linear-quadratic regulator of the bare system, and is trained in the source with its
-    effects; the regulator's cost-to-go ends the cost of each plan.
+    The policy begins as the linear-quadratic regulator of the source, and is trained in it; the regulator's cost-to-go
+    ends the cost of each plan. Where a diagnosis finds effects, that of the world with these does.
 
     Raises:
-        ValueError: as `linear_quadratic`.
+        ValueError: as `Regulate.solved`.
 
     >>> import visadapt as va
     >>> source = va.World(va.CartPole())
@@ -42,8 +42,7 @@ def regulator(source: World, task: Regulate) -> Setup:
     >>> setup.policy().n_action
     1
     """
-    solved = linear_quadratic(source, task.weights, task.command_weights, task.at_goal, task.held)
-    task = replace(task, to_go=tuple(tuple(row) for row in solved.to_go.tolist()))
+    task, solved = task.solved(source)
     steps = task.episode_steps(source.period)
     tuning = TuneSettings(
         task,

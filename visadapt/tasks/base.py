@@ -8,6 +8,8 @@ from typing import Self
 import torch
 from torch import Tensor
 
+from visadapt.world import World
+
 EPISODE_STEPS = 250
 """Steps of an episode, in training and in scores, of a task that states no other number; a cart-pole's."""
 
@@ -35,6 +37,10 @@ class Task(ABC):
 
     def to(self, like: Tensor) -> Self:
         """The same task; tensors that it holds get the device and dtype of `like`."""
+        return self
+
+    def in_world(self, world: World) -> Task:
+        """The same task where the physics is that of `world`, for a task that knows the physics."""
         return self
 
     @abstractmethod

@@ -1,4 +1,4 @@
-"""The linear-quadratic regulator of a source about a state of rest."""
+"""The linear-quadratic regulator of a world about a state of rest."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from visadapt.effects import DynamicsEffect
 from visadapt.estimation.linearise import linearise_step
 from visadapt.world import World
 
@@ -28,13 +29,15 @@ class Regulator(NamedTuple):
     """(n_state, n_state) V: s' V s is the least sum of the costs of all states and commands that follow s"""
 
 
+@torch.no_grad()
 def linear_quadratic(
-    source: World, weights: Tensor, command_weights: Tensor, rest: Tensor | None = None, held: Tensor | None = None
+    world: World, weights: Tensor, command_weights: Tensor, rest: Tensor | None = None, held: Tensor | None = None
 ) -> Regulator:
     """The regulator with the least sum of weighted squared distances and commands, in float64.
 
-    The source, without its effects, is linearised at rest; the discrete algebraic Riccati equation is iterated from
-    V = 0 over SUMMED_PREDICTIONS.
+    The world, with those of its effects that act alike throughout an episode and are smooth at rest (parameters,
+    springs, damping), is linearised there; the discrete algebraic Riccati equation is iterated from V = 0 over
+    SUMMED_PREDICTIONS.
 
     Args:
         weights: (n_state,) of the squared distances. command_weights: (n_action,) of the squared commands.
@@ -44,19 +47,26 @@ def linear_quadratic(
     Raises:
         ValueError: no regulator keeps the system at rest: what moves away from it there is not moved by the commands.
     """
-    bare = source.with_effects(())
+    smooth = world.with_effects(
+        [each for each in world.effects if isinstance(each, DynamicsEffect) and _is_smooth(each)]
+    )
     weights, command_weights = weights.double().diag(), command_weights.double().diag()
     state = torch.zeros(1, len(weights)).to(weights) if rest is None else rest.to(weights)[None]
     command = state.new_zeros(len(command_weights)) if held is None else held.to(state)
-    commands = command.expand(1, bare.substeps, -1)
-    step = linearise_step(bare, bare.values.to(state), state.new_zeros(1), state, commands, by_command=True)
+    commands = command.expand(1, smooth.substeps, -1)
+    step = linearise_step(smooth, smooth.values.to(state), state.new_zeros(1), state, commands, by_command=True)
     a, b = step.by_state[0], step.by_command[0]
     to_go = torch.zeros_like(weights)
-    for _ in range(math.ceil(SUMMED_PREDICTIONS * source.system.prediction_time / source.period)):
+    for _ in range(math.ceil(SUMMED_PREDICTIONS * world.system.prediction_time / world.period)):
         after = weights + to_go
         gain = torch.linalg.solve_ex(command_weights + b.T @ after @ b, b.T @ after @ a).result
         to_go = a.T @ after @ (a - b @ gain)
     closed = a - b @ gain
     if not bool(to_go.isfinite().all()) or float(torch.linalg.eigvals(closed).abs().max()) > 1 + MAX_GROWTH:
-        raise ValueError(f"no commands keep a {source.system.name} at rest there: what moves away is not moved by them")
+        raise ValueError(f"no commands keep a {world.system.name} at rest there: what moves away is not moved by them")
     return Regulator(closed, gain, to_go)
+
+
+def _is_smooth(effect: DynamicsEffect) -> bool:
+    """Whether an effect acts alike throughout an episode and does not jump where a motion turns round."""
+    return not (effect.rubs() or effect.region() or any(parameter.is_phase for parameter in effect.table))

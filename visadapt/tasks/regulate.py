@@ -15,6 +15,8 @@ from torch import Tensor
 from visadapt.storage.toml_file import is_number, read_toml
 from visadapt.systems import System
 from visadapt.tasks.base import Task
+from visadapt.tasks.linear_quadratic import Regulator, linear_quadratic
+from visadapt.world import World
 
 TABLES = ("goal", "tolerance", "start", "limits")  # Fields with a number for each state that they name
 LEAST_POSITIVE = torch.finfo(torch.float32).tiny  # Smaller numbers count as zero
@@ -110,6 +112,24 @@ class Regulate(Task):
         """What a user gives beside the system, as plain values: `Regulate(system, **settings)` is the same task."""
         tables = {name: dict(getattr(self, name)) for name in TABLES}
         return {**tables, "effort": self.effort, "seconds": self.seconds}
+
+    def solved(self, world: World) -> tuple[Regulate, Regulator]:
+        """The task with the commands that hold the goal in `world`, and its V; and the regulator that has this V.
+
+        Raises:
+            ValueError: no command holds the goal there, or as `linear_quadratic`.
+        """
+        with torch.no_grad():
+            system = world.altered(self.at_goal[None])
+        task = replace(self, system=system, to_go=())
+        regulator = linear_quadratic(world, task.weights, task.command_weights, task.at_goal, task.held)
+        return replace(task, to_go=tuple(tuple(row) for row in regulator.to_go.tolist())), regulator
+
+    def in_world(self, world: World) -> Regulate:
+        try:
+            return self.solved(world)[0]
+        except ValueError:  # the machine no longer holds the goal: its own commands there are as good as any
+            return self
 
     def _of_states(self, values: Mapping[str, float], otherwise: float) -> Tensor:
         """(n_state,) values by the states' names, in float64."""
