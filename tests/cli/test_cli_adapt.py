@@ -115,6 +115,23 @@ def test_without_a_gap_the_policy_is_left_as_it_is(here, capsys):
     assert json.loads((here / "run" / "ledger.json").read_text())["rounds"][0]["policy_loss"] is None
 
 
+def test_under_a_late_motor_the_policy_stays_what_it_was_and_the_tuned_one_is_kept(here, capsys):
+    (here / "late.py").write_text(
+        "import visadapt as va\n\n\ndef target():\n"
+        "    return va.SyntheticTarget(lambda batch, generator: [va.effects.ActuatorDelay(delay=0.05)])\n"
+    )
+    samples = ("--samples", 120, "--round", 30, "--iterations", 100, "--out", "run")
+    assert run("adapt", "--policy", SHIPPED, "--target", "late:target", *samples) == 0
+    said = capsys.readouterr().out
+    assert "as, since the tuned one, run/tuned.safetensors, was worse: " in said
+    assert "of its episodes on the machine ended early" in said
+    target = va.SyntheticTarget(lambda batch, generator: [va.effects.ActuatorDelay(delay=0.05)])
+    files = (SHIPPED, "run/policy.safetensors", "run/tuned.safetensors")
+    before, after, tuned = (va.score(va.load_policy(file), target, episodes=4, steps=60) for file in files)
+    assert before == after
+    assert tuned.mean_length < 20
+
+
 def test_a_round_too_short_to_diagnose_is_refused_before_a_folder_is_made(here, capsys):
     (here / "same.py").write_text("import visadapt as va\n\n\ndef target():\n    return va.SyntheticTarget()\n")
     command = ("adapt", "--policy", SHIPPED, "--target", "same:target", "--diagnose", "--samples", 40, "--out", "run")

@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-import visadapt as va
-from visadapt.effects import ActuatorDelay
 from visadapt.learning.setback import Performance, setback
 from visadapt.recordings import Episode
 from visadapt.tasks.balance import PAPER_CARTPOLE, Balance
@@ -63,16 +61,3 @@ def test_of_a_machine_that_keeps_its_task_to_itself_no_cost_is_known():
     assert math.isnan(Performance.of([flown], 20, Reach()).cost)
     goals = Reach().training_start(1, 1.0, torch.Generator().manual_seed(0))[1].expand(20, -1).numpy().astype(float)
     assert Performance.of([replace(flown, task_state=goals)], 20, Reach()).cost > 0
-
-
-def test_under_a_late_motor_the_policy_stays_what_it_was(tmp_path):
-    policy, motor = va.load_policy(va.shipped("cartpole_states")), ActuatorDelay(delay=0.05)
-    target = va.SyntheticTarget(lambda batch, generator: [motor])
-    source = va.World(va.CartPole())
-    result = va.adapt(policy, source, target, 120, tmp_path / "run", round_samples=30, iterations=100)
-    assert "of its episodes on the machine ended early" in result.taken_back
-    steps = 60
-    scores = [va.score(one, target, episodes=4, steps=steps) for one in (policy, result.policy)]
-    assert scores[0] == scores[1]
-    result.restore(result.policy, 120)  # the tuned one is still there
-    assert va.score(result.policy, target, episodes=4, steps=steps).mean_length < steps / 3
