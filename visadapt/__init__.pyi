@@ -29,8 +29,9 @@ from .systems.cartpole import CartPole as CartPole
 from .systems.fixed_wing import FixedWing as FixedWing
 from .systems.parameter_file import load_parameters as load_parameters
 from .systems.quadrotor import Quadrotor as Quadrotor
-from .targets.base import Observation as Observation, Target as Target
+from .targets.base import Observation as Observation, Target as Target, TaskTarget as TaskTarget
 from .targets.env_map import Entry as Entry, EnvMap as EnvMap
+from .targets.following import FollowingTarget as FollowingTarget
 from .targets.gymnasium import GymnasiumTarget as GymnasiumTarget
 from .targets.regulation import RegulationTarget as RegulationTarget
 from .targets.rollout import run as run

@@ -121,7 +121,7 @@ def test_a_quadrotor_of_one_s_own_without_a_task_has_no_score(here, capsys):
         "    def step(self, action):\n        return self.reset(len(action), None)\n"
     )
     line = refused(capsys, *score("--policy", va.shipped("quadrotor"), "--target", "quad:Quad"))
-    assert line == "visadapt: quad: flights are scored by their task: derive the target from FlightTarget"
+    assert line == "visadapt: quad: flights are scored by their task: derive the target from TaskTarget"
 
 
 def test_policies_that_it_refuses(here, trained, capsys):

@@ -115,7 +115,7 @@ def test_what_is_no_cart_and_no_flight_is_not_scored_as_one(system):
 
     with pytest.raises(ValueError, match="is a fixed_wing: use run"):
         score(load_policy(shipped("cartpole_states")), Motor(), episodes=1)
-    with pytest.raises(ValueError, match="flights are scored by their task: derive the target from FlightTarget"):
+    with pytest.raises(ValueError, match="flights are scored by their task: derive the target from TaskTarget"):
         score(load_policy(shipped("fixed_wing")), SyntheticTarget(), episodes=1)
 
 

@@ -161,6 +161,7 @@ def score(parser: argparse.ArgumentParser) -> None:
     )
     add = parser.add_argument
     _add_policy_and_target(parser)
+    add("--references", metavar="F.csv", help="what a quadrotor is to follow, if the target has none")
     add("--episodes", metavar="N", type=_positive, default=100, help="(default: 100)")
     seed_help = f"seed of the starts and hidden effects (default: {SCORE_SEED})"
     add("--seed", metavar="N", type=_seed, default=SCORE_SEED, help=seed_help)

@@ -12,14 +12,16 @@ from typing import Any
 import torch
 
 from visadapt.cli.errors import InputError
-from visadapt.cli.user_code import describe, find_factory, own_code
+from visadapt.cli.user_code import as_input_error, describe, find_factory, own_code
 from visadapt.policies import Policy
+from visadapt.policies.flight import FollowPolicy
 from visadapt.setups.policy_file import load_policy, load_source
-from visadapt.targets import Target
+from visadapt.targets import FollowingTarget, Target, TaskTarget
 from visadapt.targets.base import periods_differ
 from visadapt.targets.env_map import EnvMap
 from visadapt.targets.gymnasium import GymnasiumTarget
 from visadapt.targets.rollout import SHOWN, checked_copy
+from visadapt.tasks.references import read_reference
 from visadapt.world import World
 
 
@@ -32,8 +34,18 @@ def load_policy_and_target(options: argparse.Namespace) -> tuple[Policy, World, 
     """
     policy, source = load_policy_and_source(options)
     target = load_target(options, source, policy.shown == "frame")
+    references = read_reference(options.references, source.period) if getattr(options, "references", None) else None
+    if references is not None and isinstance(policy, FollowPolicy) and not _has_goal(target):
+        with as_input_error():
+            target = FollowingTarget(target, references)
     _check(options.policy, policy, source, target)
     return policy, source, target
+
+
+def _has_goal(target: Target) -> bool:
+    """Whether a target shows a goal of its own. A reset is no step: it is not counted."""
+    shown = target.reset(1, torch.Generator().manual_seed(0))
+    return isinstance(target, TaskTarget) or getattr(shown, "goal", None) is not None
 
 
 def load_policy_and_source(options: argparse.Namespace) -> tuple[Policy, World]:

@@ -13,7 +13,7 @@ import torch
 from visadapt.policies import Policy, RegulatorPolicy
 from visadapt.policies.base import check_policy
 from visadapt.systems import CartPole
-from visadapt.targets import FlightTarget, Target
+from visadapt.targets import Target, TaskTarget
 from visadapt.targets.rollout import Run, check_period, run
 from visadapt.tasks.base import EPISODE_STEPS
 from visadapt.tasks.regulate import steps_in
@@ -85,7 +85,7 @@ def score(  # type: ignore[overload-overlap]
 ) -> RegulationScore: ...
 @overload
 def score(  # type: ignore[overload-overlap]
-    policy: Policy, target: FlightTarget, episodes: int = ..., seed: int = ..., steps: int | None = ...
+    policy: Policy, target: TaskTarget, episodes: int = ..., seed: int = ..., steps: int | None = ...
 ) -> FlightScore: ...
 @overload
 def score(
@@ -107,7 +107,7 @@ def score(
     Raises:
         TypeError: something else in the place of a policy.
         ValueError: more steps than the task of a flight has, no episode or step, a policy that was trained for another
-            period or is shown a goal on a target that is no `FlightTarget`, or a target whose system is neither a
+            period or is shown a goal on a target that is no `TaskTarget`, or a target whose system is neither a
             vehicle nor a cart-pole, or that shows no cart speed.
 
     >>> import visadapt as va
@@ -124,13 +124,13 @@ def score(
     if isinstance(policy, RegulatorPolicy):
         steps = steps or steps_in(policy.task["seconds"], target.period)
         return _score_regulation(run(target, policy, episodes, steps, generator, keep_frames=False), policy)
-    if isinstance(target, FlightTarget):
+    if isinstance(target, TaskTarget):
         if steps is not None and steps > target.task.steps:
             raise ValueError(f"a flight of this task has {target.task.steps} steps, got steps = {steps}")
         runs = run(target, policy, episodes, steps or target.task.steps, generator, strict=False, keep_frames=False)
         return _score_flights(runs, target)
     if policy.shown == "state and goal":
-        raise ValueError(f"{target.name}: flights are scored by their task: derive the target from FlightTarget")
+        raise ValueError(f"{target.name}: flights are scored by their task: derive the target from TaskTarget")
     kind = target.system_class
     if kind is not None and not issubclass(kind, CartPole):
         raise ValueError(f"a score is that of a cart's speed or of a flight; {target.name} is a {kind.name}: use run")
@@ -176,7 +176,7 @@ def _score_regulation(runs: Sequence[Run], policy: RegulatorPolicy) -> Regulatio
     return RegulationScore(len(runs), len(states), errors, units)
 
 
-def _score_flights(runs: Sequence[Run], target: FlightTarget) -> FlightScore:
+def _score_flights(runs: Sequence[Run], target: TaskTarget) -> FlightScore:
     misses = []
     for k, flown in enumerate(runs):
         if flown.survived:

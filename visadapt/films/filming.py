@@ -14,8 +14,8 @@ from visadapt.films.flight_film import FlightFilm
 from visadapt.films.flight_panel import FlightPanel
 from visadapt.policies import Policy
 from visadapt.progress import Progress
-from visadapt.systems import CartPole, RigidBody
-from visadapt.targets import FlightTarget, SyntheticTarget, Target
+from visadapt.systems import CartPole, FixedWing, Quadrotor, RigidBody
+from visadapt.targets import SyntheticTarget, Target, TaskTarget
 from visadapt.targets.gymnasium import GymnasiumTarget
 from visadapt.targets.rollout import Run, See, check_period, run, see_within_a_turn
 from visadapt.tasks.follow import Follow
@@ -82,7 +82,7 @@ def check_filmable(target: Target) -> None:
 def _run(policy: Policy, target: Target, seconds: float, seed: int, see: See | None) -> Run:
     check_period(policy, target)
     steps = round(seconds / target.period)
-    if isinstance(target, FlightTarget):
+    if isinstance(target, TaskTarget):
         steps = min(steps, target.task.steps)
     swings_up = isinstance(target, SyntheticTarget) and math.isinf(target.angle_limit)
     if see is None and policy.shown == "state" and swings_up:
@@ -92,7 +92,7 @@ def _run(policy: Policy, target: Target, seconds: float, seed: int, see: See | N
 
 
 def _film(runs: Mapping[str, Run], target: Target, due: float) -> Film:
-    if isinstance(target, FlightTarget):
+    if isinstance(target, TaskTarget):
         return FlightFilm([_flight_panel(title, each, target) for title, each in runs.items()])
     drawn = _drawn(target)
     limit, position_limit = target.angle_limit if isinstance(target, SyntheticTarget) else 0.3, None
@@ -118,10 +118,13 @@ def _drawn(target: Target) -> DrawnCartPole:
     return DrawnCartPole()
 
 
-def _flight_panel(title: str, flown: Run, target: FlightTarget) -> FlightPanel:
+def _flight_panel(title: str, flown: Run, target: TaskTarget) -> FlightPanel:
     if flown.episode.task_state is None:
         raise ValueError(f"panel {title!r}: the run does not hold its progress in the task of {target.name}")
     task_state = torch.as_tensor(flown.episode.task_state[0])
     # References are chosen by whole numbers, points are positions.
     task_state = task_state.long() if isinstance(target.task, Follow) else task_state
-    return FlightPanel(title, flown, target.system, target.task, task_state)
+    vehicle = target.system
+    if not isinstance(vehicle, RigidBody):  # one of unknown sizes is drawn in the usual ones
+        vehicle = Quadrotor() if isinstance(target.task, Follow) else FixedWing()
+    return FlightPanel(title, flown, vehicle, target.task, task_state)

@@ -34,7 +34,7 @@ from visadapt.progress import Progress, Report, staged
 from visadapt.recordings import Episode, read_recording, write_recording
 from visadapt.storage.checkpoints import CheckpointError, fitting, load_tree, load_weights, save_tree
 from visadapt.systems import System
-from visadapt.targets import FlightTarget, Target, TargetError
+from visadapt.targets import Target, TargetError, TaskTarget
 from visadapt.targets.rollout import run
 from visadapt.tasks.base import Task
 from visadapt.world import World
@@ -204,7 +204,7 @@ class JointLearning:
         # none, since the target's states are not for a policy that sees frames; nor where sensors are found to be
         # wrong, since a policy that allows for it does well where its readings do not show it.
         task: Task | None = self.settings.tuning.task
-        if isinstance(self.target, FlightTarget):
+        if isinstance(self.target, TaskTarget):
             task = self.target.task
         elif self.observe is not None or any(isinstance(effect, SensingEffect) for effect in self.found.effects):
             task = None

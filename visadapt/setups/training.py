@@ -23,7 +23,7 @@ from visadapt.setups.flight import fixed_wing, quadrotor
 from visadapt.setups.policy_file import save_policy
 from visadapt.setups.regulator import regulator
 from visadapt.systems import CartPole, FixedWing, Quadrotor
-from visadapt.targets import FlightTarget, Target
+from visadapt.targets import Target, TaskTarget
 from visadapt.tasks.follow import Follow
 from visadapt.tasks.reach import Reach
 from visadapt.tasks.references import Reference
@@ -271,12 +271,12 @@ def setup_to_adapt(
     references: Reference | None = None,
     with_history: bool = False,
 ) -> Setup:
-    """As `setup_for`, with the references, or the points, that a `FlightTarget` has.
+    """As `setup_for`, with the references, or the points, that a `TaskTarget` has.
 
     Raises:
         ValueError: as `setup_for`, or other references than the target's own, with a history.
     """
-    task = target.task if isinstance(target, FlightTarget) else None
+    task = target.task if isinstance(target, TaskTarget) else None
     if isinstance(task, Follow):
         own = task.references
         if references is None:

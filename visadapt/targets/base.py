@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from visadapt.systems import System
+from visadapt.tasks.base import FlightTask
 
 PERIOD_ROUNDING = 1e-6  # s, by which equal periods may differ
 
@@ -82,3 +83,19 @@ class Target(ABC):
     @abstractmethod
     def step(self, action: Tensor) -> Observation:
         """Execute the action (B, n_action), in the range of the policy's commands, for one period."""
+
+
+class TaskTarget(Target):
+    """A target of a vehicle with a task, by which its flights are scored and filmed.
+
+    What it shows has a goal, `task.goal`, and the task's state.
+
+    >>> import visadapt as va
+    >>> from visadapt.tasks.reach import Reach
+    >>> isinstance(va.FlightTarget(Reach(), va.FixedWing()), va.TaskTarget)
+    True
+    """
+
+    task: FlightTask
+    first: Tensor
+    """(B, n_task_state) in which the flights started"""

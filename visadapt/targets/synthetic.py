@@ -13,7 +13,7 @@ from renderers import DrawnCartPole
 from visadapt.effects import ConstantForce, Effect, PeriodicForce
 from visadapt.systems import CartPole, RigidBody, System
 from visadapt.systems.integrators import steps_within
-from visadapt.targets.base import Observation, Target, TargetError
+from visadapt.targets.base import Observation, Target, TargetError, TaskTarget
 from visadapt.tasks.base import FlightTask
 from visadapt.world import World, WorldState
 
@@ -177,7 +177,7 @@ class SyntheticTarget(WorldTarget):
         return torch.from_numpy(self.camera(shown[:, 0], shown[:, 2])).to(state) / 255
 
 
-class FlightTarget(WorldTarget):
+class FlightTarget(WorldTarget, TaskTarget):
     """A vehicle with hidden effects, integrated more finely and by another method than any source.
 
     A flight ends when its state is no longer finite or, with a finite `reach`, when it is too far off.
@@ -206,8 +206,6 @@ class FlightTarget(WorldTarget):
         self.task = task
         self.system: RigidBody = system
         self.reach = reach
-        self.first: Tensor
-        """task states in which the flights started"""
         self._task_state: Tensor
 
     def reset(self, batch: int, generator: torch.Generator) -> Observation:
