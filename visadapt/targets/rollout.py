@@ -43,7 +43,7 @@ def see_goals(observation: Observation) -> Tensor:
     """States and, after them, goals (B, n_state + n_goal)."""
     if observation.goal is None:
         raise TargetError(
-            "the policy is shown its goal, but the target has none: give it references, --references on the command line, or a task"
+            "the policy is shown its goal, but the target has none: give it references (on the command line --references)"
         )
     return torch.cat((observation.state, observation.goal), 1)
 
