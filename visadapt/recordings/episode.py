@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,6 +74,11 @@ class Episode:
     def samples(self) -> int:
         """Executed actions: what the ledger counts."""
         return len(self.time) - 1
+
+    def first(self, rows: int) -> Episode:
+        """Its first `rows`."""
+        arrays = {each.name: getattr(self, each.name) for each in fields(self)}
+        return replace(self, **{name: values[:rows] for name, values in arrays.items() if values is not None})
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from visadapt.diagnosis.result import Push
 from visadapt.diagnosis.search import angle_defect, sensor_checks, sign_conventions
+from visadapt.diagnosis.search.motor_off import without_idle_ends
 from visadapt.diagnosis.search.pushed_rows import pushed_rows
 from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.words import A_ROW_LATE, DERIVED, OPPOSITE
@@ -71,7 +72,9 @@ already, and the time grows with the rows. Of a longer recording, stretches of S
 
 
 def limited(recording: Recording, system: System) -> Recording:
-    """The recording; where it has more rows than a diagnosis uses, stretches that are spread evenly over it."""
+    """The recording as far as its commands act; where it has more rows than a diagnosis uses, stretches that are spread
+    evenly over it."""
+    recording = without_idle_ends(recording, system)
     profile = profile_of(system)
     stretch = STRETCH_WINDOWS * max(profile.window_rows, round(system.prediction_time / recording.period))
     return spread(
