@@ -73,8 +73,8 @@ def find_repeats(
     ]
     resting = [_resting(values, torch.tensor(steps).to(values)) for values in measured]
     whole_rows = [
-        (_equal(values) | ~twice).all(1) & each.any(1) & ~rest
-        for values, twice, each, rest in zip(measured, both, same, resting, strict=True)
+        ~(~_equal(values) & (read > 0)).any(1) & each.any(1) & ~rest & _after_a_change(values, twice)
+        for values, read, twice, each, rest in zip(measured, usable, both, same, resting, strict=True)
     ]
     lost = _unless_by_chance(whole_rows, min(by_chance))
     # A rate from a separate sensor may go on while the angle stands still.
@@ -121,6 +121,12 @@ def read_twice(usable: Tensor) -> Tensor:
     """Which of the `usable` (T, m) readings, those above 0, follow one of the row before, which they may repeat."""
     read = usable > 0
     return torch.cat((torch.zeros_like(read[:1]), read[1:] & read[:-1]))
+
+
+def _after_a_change(values: Tensor, twice: Tensor) -> Tensor:
+    """Which rows (T,) follow a change of what was read in them and in the row before; where everything was, all do."""
+    changed = (~_equal(values) & twice).any(1).cumsum(0) > 0
+    return changed | twice.all(1)
 
 
 def _resting(values: Tensor, steps: Tensor) -> Tensor:

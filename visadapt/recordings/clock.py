@@ -170,6 +170,8 @@ def check_steps(episodes: Sequence[RawEpisode], system: System) -> None:
 def without_bursts(raw: RawEpisode, note: Note) -> RawEpisode:
     """The episode on a steady clock where its rows are stamped as they arrived, several at once."""
     steps = np.diff(raw.time)
+    if raw.usable is not None:  # rows of several sensors, each at its own instants
+        return raw
     if len(steps) < FEWEST_IN_BURSTS or np.median(steps) > BURST_STEP * steps.mean():
         return raw
     index, newest = np.arange(len(raw.time)), np.flatnonzero(steps > steps.mean())  # the last of each burst

@@ -35,6 +35,8 @@ SEPARATORS = "\t;,"
 
 UTF_16_MARKS = (b"\xff\xfe", b"\xfe\xff")
 
+EMPTY = ("", "na", "n/a", "none", "null")  # Cells without a number, as tables are written
+
 PLAIN = frozenset(string.printable) - frozenset('"#_')  # Characters of lines without quoted cells and comments
 
 
@@ -180,7 +182,7 @@ class Table:
                 raise RecordingError(f"{where} has {len(cells)} cells, the line of names {len(self.header)}")
             used = [cells[column].partition("#")[0] for column in columns]
             try:
-                values = [_number(cell) if cell.strip() else math.nan for cell in used]
+                values = [math.nan if cell.strip().lower() in EMPTY else _number(cell) for cell in used]
             except ValueError:
                 column, cell = next(each for each in zip(columns, used, strict=True) if not _is_number(each[1]))
                 raise RecordingError(f"{where}, column {self.header[column]!r} {_complaint(cell)}") from None

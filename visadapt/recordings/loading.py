@@ -105,7 +105,7 @@ def load_recording(
             check_forward(raw)
         episodes = [without_bursts(raw, note) for raw in episodes]
         check_steps(episodes, system)
-        whole += [without_outliers(without_held_readings(raw, system, note), system, note) for raw in episodes]
+        whole += [without_outliers(raw, system, note) for raw in without_held_readings(episodes, system, note)]
     whole = [in_flight(raw, system, note) for raw in _commands(_shared(whole, system, note), system, note)]
     check_commands(whole, system, note)
     if not frames:

@@ -6,6 +6,7 @@ angle stands still.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,53 +17,65 @@ from visadapt.recordings.runs import runs
 from visadapt.recordings.sensors import TURN, variable_of
 from visadapt.systems import System
 
+Floats = NDArray[np.float64]
+
 ENTERED_STEPS, LEFT_STEPS = 2.5, 1.5
 """Changes into and out of a run of equal readings, of which the larger exceeds ENTERED_STEPS of the sensor's steps and
 the smaller LEFT_STEPS: the sensor moved on, so a reading that it repeats was held."""
-FEWEST_RUNS = 30
-"""Fewest such runs from which a sensor's rate is told."""
-LONGEST_RUN = 3.0
+LONGEST_RUN = 6.0
 """Rows of a run, over the median, up to which the machine cannot have rested within it."""
-LEAST_ROWS = 1.1
-"""Mean rows of a run from which on a sensor is slower than the rows."""
+MOST_DISPERSION = 0.5
+"""Variance of intervals over that of rows lost at random (a geometric distribution), below which they are regular: a
+sensor with a clock of its own, even one that misses some readings."""
+LEAST_LOG_ODDS = 12.0
+"""Log likelihood that the intervals' own distribution gains over that of rows lost at random, at least."""
 LEAST_ZERO = 0.25
 """Share of zeros among a rate's values while its moving position is held, above which it is derived from that."""
-LEAST_EMPTY = 0.05
-"""Share of empty cells from which on a column is that of a sensor slower than the rows; fewer are refused."""
-RUNS_TOGETHER = 8
-MOST_DISPERSION = 0.25
-"""Variance of the rows of a run, or of RUNS_TOGETHER runs for each of them, over that where rows are lost at random; a
-sensor with a clock of its own has hardly any."""
+FEWEST_EMPTY = 3
+"""Empty cells of a column from which on they are those of a sensor that was not read; fewer are refused."""
 
 
-def without_held_readings(raw: RawEpisode, system: System, note: Note) -> RawEpisode:
-    """The episode with the readings marked as not usable that repeat the last one of a sensor slower than the rows, and
-    without rates that were derived from these."""
-    found = {name: fresh for name, values in raw.states.items() if (fresh := _fresh(values)) is not None}
+def without_held_readings(episodes: Sequence[RawEpisode], system: System, note: Note) -> list[RawEpisode]:
+    """The episodes of a file with the readings marked as not usable that repeat the last one of a sensor slower than
+    the rows, and without rates that were derived from these."""
+    if not episodes:
+        return []
+    origin, names = str(episodes[0].path), list(episodes[0].measured)
+    found = {name: fresh for name in names if (fresh := _fresh([raw.states[name] for raw in episodes])) is not None}
     for name in [*found]:
         rate = system.rate_of(name)
-        if rate in raw.measured and _is_derived(raw.states[rate], raw.states[name], found[name]):
-            note(f"{rate} is 0 while {name} is held: derived on the rig from it, not measured; left out", raw.origin)
+        if rate in names and _is_derived([(raw.states[rate], raw.states[name]) for raw in episodes], found[name]):
+            note(f"{rate} is 0 while {name} is held: derived on the rig from it, not measured; left out", origin)
             found.pop(rate, None)
-            raw = raw.of([other for other in raw.measured if other != rate])
+            names.remove(rate)
     told: dict[str, list[str]] = {}
-    usable = np.ones(raw.state.shape, bool)
     for name, fresh in found.items():
-        usable[:, raw.measured.index(name)] = fresh
-        interval = np.ptp(raw.time[fresh]) / (fresh.sum() - 1)
-        told.setdefault(f"{1 / fresh.mean():.2g} rows ({interval:.2g} s)", []).append(name)
-    for every, names in told.items():
+        share = float(np.concatenate(fresh).mean())
+        period = float(np.median(np.concatenate([np.diff(raw.time) for raw in episodes])))
+        told.setdefault(f"{1 / share:.2g} rows ({period / share:.2g} s)", []).append(name)
+    for every, slow in told.items():
         note(
-            f"{', '.join(names)}: read about every {every} and held in between: only new readings are used, which may "
+            f"{', '.join(slow)}: read about every {every} and held in between: only new readings are used, which may "
             "be late by up to a row",
-            raw.origin,
+            origin,
         )
-    return with_usable(raw, usable, system)
+    out = []
+    for number, raw in enumerate(raw.of(names) for raw in episodes):
+        usable = [found[name][number] if name in found else np.ones(len(raw.time), bool) for name in names]
+        out.append(with_usable(raw, np.column_stack(usable), system) if found else raw)
+    return out
 
 
-def _is_derived(rate: NDArray[np.float64], position: NDArray[np.float64], fresh: NDArray[np.bool_]) -> bool:
-    """Whether a rate (T,) is the difference of a position (T,) that moves and is held between `fresh` (T,) readings."""
-    zero = [rate[a + 1 : b] == 0 for a, b in runs(position) if 1 < (b - a) * fresh.mean() + 0.5 < 2 and b - a > 1]
+def _is_derived(pairs: Sequence[tuple[Floats, Floats]], fresh: Sequence[NDArray[np.bool_]]) -> bool:
+    """Whether a rate is the difference of a position that moves and is held between `fresh` readings; of episodes (T,)
+    of both."""
+    share = float(np.concatenate(fresh).mean())
+    zero = [
+        rate[a + 1 : b] == 0
+        for rate, position in pairs
+        for a, b in runs(position)
+        if b - a > 1 and 0.5 < (b - a) * share < 1.5
+    ]
     return bool(zero) and float(np.concatenate(zero).mean()) > LEAST_ZERO
 
 
@@ -70,10 +83,10 @@ def with_empty_cells(raw: RawEpisode, system: System, note: Note) -> RawEpisode:
     """The episode of a table in which the cells of a sensor slower than the rows are empty, or those of commands that
     come less often: these are held until the next.
 
-    A column in which few cells are empty stays as it is.
+    A column in which hardly a cell is empty stays as it is.
     """
     empty = np.isnan(raw.action)
-    sparse = empty.mean(0) > LEAST_EMPTY
+    sparse = empty.sum(0) >= FEWEST_EMPTY
     if sparse.any():
         first = int((~empty[:, sparse]).argmax(0).max())
         raw, empty = raw.part(first, len(raw.time)), empty[first:]
@@ -81,44 +94,73 @@ def with_empty_cells(raw: RawEpisode, system: System, note: Note) -> RawEpisode:
         for column in np.flatnonzero(sparse):
             rows = np.where(empty[:, column], 0, np.arange(len(action)))
             action[:, column] = action[np.maximum.accumulate(rows), column]
-            told = f"{system.actions[column].name} is empty in {empty[:, column].mean():.0%} of the rows: held in them"
+            told = f"{system.actions[column].name} is empty in {int(empty[:, column].sum())} of {len(empty)} rows: held"
             note(told + (f"; the {first} rows before the first command are left out" if first else ""), raw.origin)
         raw = replace(raw, action=action)
     missing = np.isnan(raw.state)
-    sparse = (missing.mean(0) > LEAST_EMPTY) & ~missing.all(0)
+    sparse = (missing.sum(0) >= FEWEST_EMPTY) & ~missing.all(0)
     if not sparse.any():
         return raw
     names = ", ".join(name for name, few in zip(raw.measured, sparse, strict=True) if few)
-    note(
-        f"{names}: read in the rows in which cells are not empty, {(~missing[:, sparse]).mean():.0%} of all", raw.origin
-    )
+    some = int(missing[:, sparse].any(1).sum())
+    note(f"{names}: cells are empty in {some} of {len(missing)} rows: not read there", raw.origin)
     return with_usable(raw, ~(missing & sparse), system)
 
 
-def _fresh(values: NDArray[np.float64]) -> NDArray[np.bool_] | None:
-    """Which of a sensor's values (T,) are new readings; None where it is as fast as the rows, or repeats at random."""
-    starts = np.array([start for start, _ in runs(values)])
-    if len(starts) < FEWEST_RUNS + 2:
+def _fresh(episodes: Sequence[Floats]) -> list[NDArray[np.bool_]] | None:
+    """Which of a sensor's values (T,) of episodes are new readings; None where it is as fast as the rows, or repeats at
+    random."""
+    starts = [np.array([start for start, _ in runs(values)]) for values in episodes]
+    jumps = [np.abs(np.diff(values[first])) for values, first in zip(episodes, starts, strict=True)]
+    step = min((float(each.min()) for each in jumps if len(each)), default=0.0)
+    moving = [_moves(each, step) for each in jumps]
+    lengths = [np.diff(first)[1:][moves] for first, moves in zip(starts, moving, strict=True)]
+    held = [_repeated(first[1:-1][moves], own) for first, moves, own in zip(starts, moving, lengths, strict=True)]
+    rows = _usual(np.concatenate([np.zeros(0), *lengths]))
+    # Of a sensor nearly as fast as the rows, few readings are held, but at regular intervals.
+    if not (_is_regular(rows) or _is_regular(_usual(np.concatenate([np.diff(each) for each in held])))):
         return None
-    jumps = np.abs(np.diff(values[starts]))
-    step = jumps.min()
+    mean, out = float(rows.mean()), []
+    for values, first, moves in zip(episodes, starts, moving, strict=True):
+        fresh = np.zeros(len(values), bool)
+        fresh[first] = True
+        ends = np.append(first[1:], len(values))
+        still = np.pad(~moves, 1, constant_values=True)[: len(first)]
+        for start, end in np.column_stack((first, ends))[still]:
+            # At rest, a sensor reads the same value several times.
+            fresh[start + np.round(mean * np.arange(round((end - start) / mean))).astype(int)] = True
+        out.append(fresh)
+    return out
+
+
+def _moves(jumps: Floats, step: float) -> NDArray[np.bool_]:
+    """Whether a sensor with this `step` moves on at both ends of each run, all but the first and the last, of readings
+    that jump by `jumps` from run to run."""
     smaller, larger = np.minimum(jumps[:-1], jumps[1:]), np.maximum(jumps[:-1], jumps[1:])
-    moving = (smaller > LEFT_STEPS * step) & (larger > ENTERED_STEPS * step)  # all runs but the first and the last
-    rows = np.diff(starts)[1:][moving]
-    rows = rows[rows <= LONGEST_RUN * np.median(rows)] if len(rows) else rows
-    mean = rows.mean() if len(rows) >= FEWEST_RUNS else 1.0
-    if mean < LEAST_ROWS:
-        return None
-    together = rows[: len(rows) // RUNS_TOGETHER * RUNS_TOGETHER].reshape(-1, RUNS_TOGETHER).sum(1)
-    variance = min(rows.var(), together.var() / RUNS_TOGETHER) if len(together) > RUNS_TOGETHER else rows.var()
-    if variance > MOST_DISPERSION * mean * (mean - 1):
-        return None
-    fresh = np.zeros(len(values), bool)
-    fresh[starts] = True
-    for start, end in np.column_stack((starts, np.append(starts[1:], len(values))))[~np.pad(moving, 1)]:
-        # At rest, a sensor reads the same value several times.
-        fresh[start + np.round(mean * np.arange(round((end - start) / mean))).astype(int)] = True
-    return fresh
+    moves: NDArray[np.bool_] = (smaller > LEFT_STEPS * step) & (larger > ENTERED_STEPS * step)
+    return moves
+
+
+def _repeated(starts: NDArray[np.intp], lengths: NDArray[np.intp]) -> Floats:
+    """All rows but the first of runs that start at (K,) rows and have these lengths (K,)."""
+    return np.concatenate(
+        [np.zeros(0), *(start + np.arange(1, own) for start, own in zip(starts, lengths, strict=True))]
+    )
+
+
+def _usual(rows: Floats) -> Floats:
+    """Those of numbers of rows (N,) within which the machine cannot have rested."""
+    return rows[rows <= LONGEST_RUN * np.median(rows)] if len(rows) else rows
+
+
+def _is_regular(rows: Floats) -> bool:
+    """Whether numbers of rows (N,) are more alike than those between rows that are lost at random."""
+    mean = float(rows.mean()) if len(rows) else 1.0
+    if mean == 1 or rows.var() > MOST_DISPERSION * mean * (mean - 1):
+        return False
+    values, counts = np.unique(rows, return_counts=True)
+    at_random = -np.log(mean) + (values - 1) * np.log1p(-1 / mean)
+    return float((counts * (np.log(counts / len(rows)) - at_random)).sum()) > LEAST_LOG_ODDS
 
 
 def with_usable(raw: RawEpisode, usable: NDArray[np.bool_], system: System) -> RawEpisode:

@@ -177,7 +177,7 @@ def _of_folds(
 
     # Episodes may be shorter than the time of a prediction.
     horizon = max(1, min(round(system.prediction_time / rows.period), int(rows.inside.sum(1).max()) - 1))
-    parts = []
+    parts, stride = [], _stride(system, rows)
     for k in indices:
         box = None
         if black_box:
@@ -185,17 +185,26 @@ def _of_folds(
             with suppress(torch.linalg.LinAlgError):  # type: ignore[attr-defined]  # then nothing is predicted better than without it
                 box = fit_black_box(*on(k, others[rows.select(others).spread(BLACK_BOX_ROWS)]))
         held = out[k].nonzero()[:, 0]
-        parts.append((held, rollout_errors(*on(k, held), horizon, box)))
+        parts.append((held, rollout_errors(*on(k, held), horizon, stride, box)))
     return parts
 
 
+def _stride(system: System, rows: Segments) -> int:
+    """Rows from one start of predictions to the next. They have no factor in common with the rows between a sensor's
+    readings: else no prediction may end where it is read."""
+    inside, read = rows.inside.sum(), rows.used.sum((0, 1)).clamp(min=1)
+    apart = math.lcm(*(inside / read).round().int().tolist())
+    fastest = max(1, int(START_SPACING * system.prediction_time / rows.period + 1e-9))
+    return next(stride for stride in range(fastest, 0, -1) if math.gcd(stride, apart) == 1)
+
+
 def rollout_errors(
-    model: CandidateModel, fits: FitState, horizon: int, black_box: BlackBox | None = None
+    model: CandidateModel, fits: FitState, horizon: int, stride: int = 1, black_box: BlackBox | None = None
 ) -> RolloutErrors:
-    """Errors of one fitted set up to `horizon` rows ahead, perhaps with a black box, whose loads follow the states."""
+    """Errors of one fitted set up to `horizon` rows ahead of every `stride`-th, perhaps with a black box, whose loads
+    follow the states."""
     rows = model.rows
     length = rows.shape[1]
-    stride = max(1, int(START_SPACING * model.system.prediction_time / rows.period + 1e-9))
     if black_box is not None:
         fits = replace(fits, log_process=black_box.fits.log_process)
     problem = linear_problem([model], fits).data()
