@@ -63,6 +63,18 @@ def test_an_angle_that_stands_still_in_a_zone_of_an_encoder_is_found():
     assert int((frozen & ~found).sum()) <= 0.1 * int(frozen.sum())
 
 
+@pytest.mark.parametrize("rate", [0.05, 0.2])
+def test_an_angle_that_is_missed_now_and_then_stands_still_in_no_zone(rate):
+    values = moving()
+    missed = torch.rand(len(values), generator=torch.Generator().manual_seed(1)) < rate
+    missed[0] = False
+    found = find_repeats([with_repeats(values, missed, [1])], (0, 2), ANGLE)
+    assert not bool(found.frozen[0].any() | found.lost[0].any())
+    left_out = found.used[0][:, 1] == 0
+    assert int((missed & ~left_out).sum()) <= 0.15 * int(missed.sum())
+    assert bool((found.used[0][:, 0] == 1).all())
+
+
 def test_a_slow_motion_through_that_zone_is_not_measured_there():
     fast, slow = moving(), moving()
     slow[:, 1] = ((0.035 + 0.02 * (0.2 * torch.arange(len(slow)) * 0.05).sin()) / COUNTS[1]).round() * COUNTS[1]

@@ -43,10 +43,37 @@ def test_only_readings_are_used_and_the_others_lie_between(file, run, fresh, emp
     between = np.interp(run["time"], run["time"][fresh], run["x"][fresh])
     np.testing.assert_allclose(recording.episodes[0].state[:, 0], between)
     (said,) = (one for one in recording.warnings if "not measured" not in one)
-    assert (f"x: cells are empty in {(~fresh).sum()} of {ROWS} rows: not read there" in said) == empty
+    assert (f"cells are empty, of x in {(~fresh).sum()} of {ROWS} rows: not read there" in said) == empty
 
 
-@pytest.mark.parametrize("share", [0.1, 0.3, 0.7])
+@pytest.mark.parametrize(
+    ("every", "missed"), [(1.05, 0.0), (1.11, 0.0), (1.5, 0.0), (1.5, 0.1), (2.6, 0.1), (9.7, 0.0), (9.7, 0.1)]
+)
+def test_a_clock_of_its_own_and_readings_that_are_missed(file, run, every, missed):
+    """Over three episodes, each too short to tell."""
+    rng = np.random.default_rng(0)
+    stamps = every * np.arange(int(ROWS / every))
+    stamps = stamps[rng.uniform(size=len(stamps)) >= missed]
+    fresh = np.isin(np.arange(ROWS), np.ceil(stamps))
+    fresh[[0, 133, 266]] = True
+    table = {"episode": np.minimum(np.arange(ROWS) // 133, 2), **run, "theta": held(run["theta"], fresh)}
+    recording = load(write(file, table), columns=POSITIONS_ALONE)
+    read = np.concatenate([each[:, 1] for each in recording.usable])
+    assert (read != fresh).sum() <= 3  # at the ends of episodes
+
+
+def test_two_logs_joined_row_by_row_keep_their_stamps(file, run):
+    """Each row has one sensor; those of the second log come 2 ms later."""
+    time = 0.02 * np.repeat(np.arange(ROWS // 2), 2) + 0.002 * (np.arange(ROWS) % 2)
+    first = np.arange(ROWS) % 2 == 0
+    table = {"time": time, "x": with_empty(run["x"], ~first), "theta": with_empty(run["theta"], first)}
+    recording = load(write(file, {**table, "command": with_empty(run["command"], ~first)}), columns=POSITIONS_ALONE)
+    np.testing.assert_allclose(recording.episodes[0].time, time, atol=1e-9)
+    assert recording.period == pytest.approx(0.01)
+    np.testing.assert_array_equal(usable(recording, "x"), first)
+
+
+@pytest.mark.parametrize("share", [0.03, 0.1, 0.3, 0.7])
 def test_rows_that_are_lost_at_random_are_no_slow_sensor(file, run, share):
     fresh = np.random.default_rng(0).uniform(size=ROWS) > share
     lost = {name: held(run[name], fresh) for name in ("x", "theta")}
@@ -97,6 +124,8 @@ def test_a_slow_sensor_that_is_suddenly_elsewhere_splits_the_episode(file, run):
 
 def test_a_few_empty_cells_are_refused(file, run):
     empty = np.isin(np.arange(ROWS), [30, 40])
+    table = {**run, "x": with_empty(run["x"], np.isin(np.arange(ROWS), [30, 40, 50]))}
+    assert np.flatnonzero(~usable(load(write(file, table)), "x")).tolist() == [30, 40, 50]
     refuses(r"row 31 \(line 32\), column 'x' is empty or nan", write(file, {**run, "x": with_empty(run["x"], empty)}))
 
 

@@ -126,7 +126,9 @@ def _hiding(unexplained: Answer, finder: _PushFinder) -> tuple[Push, ...]:
     for found in each():
         further = tuple(one for one in found if not any(one.overlaps(other) for other in unexplained.set_aside))
         if further:
-            return further
+            # What a function of the state imitates in part lasts longer beyond the bare source.
+            whole = finder.pushes_beyond(explored, search.source)
+            return (*further, *(one for one in whole if any(one.overlaps(other) for other in further)))
     return ()
 
 

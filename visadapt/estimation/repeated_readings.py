@@ -32,6 +32,8 @@ NEAR_STEPS, NEAR_SHARE = 4.0, 0.2
 """Changes up to this many steps, or up to this share of the median change, from which the frequency of changes of less
 than one step is estimated."""
 
+LEAST_FROZEN = 0.3  # Share of the angles in the zone where a sensor stands still that are read as the one before
+
 ZONE_EDGE_POINTS = 120  # Angles tried for either edge of the zone in which the angle sensor stands still
 
 SMOOTHING_RATIO = 1 / 3  # Assumed standard deviation of a smoothed angle over that of a measured one
@@ -78,10 +80,12 @@ def find_repeats(
     ]
     lost = _unless_by_chance(whole_rows, min(by_chance))
     # A rate from a separate sensor may go on while the angle stands still.
-    frozen = [torch.zeros_like(whole) for whole in lost]
+    frozen = missed = [torch.zeros_like(whole) for whole in lost]
     if angle is not None:
         alone = [each[:, angle] & ~whole & ~rest for each, whole, rest in zip(same, whole_rows, resting, strict=True)]
         frozen = _unless_by_chance(alone, by_chance[angle])
+        if not _lie_in_a_zone([values[:, angle] for values in measured], frozen):
+            frozen, missed = missed, frozen
         if any(bool(still.any()) for still in frozen):
             # What a sensor slower than the rows might have shown in a row is unknown.
             unknown = [row & ~twice.all(1) for row, twice in zip(lost, both, strict=True)]
@@ -89,8 +93,8 @@ def find_repeats(
             lost = [row & ~other for row, other in zip(lost, unknown, strict=True)]
     used = []
     doubtful = frozen if angle is None else _between_held([values[:, angle] for values in measured], frozen)
-    for whole, still in zip(lost, doubtful, strict=True):
-        partial = of_angle & still[:, None]
+    for whole, still, apart in zip(lost, doubtful, missed, strict=True):
+        partial = of_angle & (still | apart)[:, None]
         # The first reading after a standstill may still be mixed with the repeated value.
         waking = torch.zeros_like(partial)
         waking[1:] = partial[:-1] & ~partial[1:]
@@ -98,6 +102,19 @@ def find_repeats(
     silent = [whole | (still & ~sure) for whole, still, sure in zip(lost, doubtful, frozen, strict=True)]
     seen = [torch.ones_like(whole) for whole in lost]
     return RepeatedReadings(used, lost, seen, frozen, silent)
+
+
+def _lie_in_a_zone(angles: Sequence[Tensor], frozen: Sequence[Tensor]) -> bool:
+    """Whether most of the angles (T,) of episodes between those that are `frozen` are frozen too; else the sensor misses
+    readings, whatever the angle is."""
+    angle, held = torch.cat([*angles]), torch.cat([*frozen])
+    if not bool(held.any()):
+        return False
+    # Whole turns apart or not.
+    centre = torch.atan2(angle[held].sin().mean(), angle[held].cos().mean())
+    angle = torch.atan2((angle - centre).sin(), (angle - centre).cos())
+    between = (angle >= angle[held].min()) & (angle <= angle[held].max())
+    return float(held[between].double().mean()) > LEAST_FROZEN
 
 
 def _between_held(angles: Sequence[Tensor], frozen: Sequence[Tensor]) -> list[Tensor]:

@@ -37,6 +37,8 @@ SHORTEST_PERIOD_S = 1e-4
 BURST_STEP, LONGEST_BURST, FEWEST_IN_BURSTS = 0.25, 25, 30
 """Rows come in bursts where the median step is below this share of the mean, and no row is further than this many rows
 from a steady clock; and the fewest steps with which this is tested."""
+ROWS_TOGETHER = 6
+"""Rows whose mean distance is a period where rows of two or three sensors come in turn, at unequal steps."""
 LEAST_STEPS = 3
 """Steps in the time of a prediction, at least."""
 LEAST_STEP_PERIODS = 1e-3
@@ -85,6 +87,13 @@ class RawEpisode:
     def states(self) -> dict[str, NDArray[np.float64]]:
         """The columns (T,) of state, by name."""
         return dict(zip(self.measured, self.state.T, strict=True))
+
+    @property
+    def period(self) -> float:
+        """s between rows, the median; of rows of several sensors, each at its own instants, the median over
+        ROWS_TOGETHER of them."""
+        rows = 1 if self.usable is None else min(ROWS_TOGETHER, len(self.time) - 1)
+        return float(np.median(self.time[rows:] - self.time[:-rows])) / rows
 
     def read(self, name: str) -> NDArray[np.intp]:
         """The rows in which a state was measured."""
@@ -191,7 +200,7 @@ def uninterrupted(raw: RawEpisode, note: Note, jumps: Sequence[int] = ()) -> lis
     steps = np.diff(raw.time)
     if len(steps) == 0:
         return [raw]
-    period = float(np.median(steps))
+    period = raw.period
     gaps = (steps > GAP_PERIODS * period * (1 + 1e-6)) & (_later_by(raw.time, period) > LATER_PERIODS * period)
     irregular = gaps.mean() > MOST_GAPS and gaps.sum() > 1
     longest = max(HARMLESS_GAP_S, (LONGEST_STEP_PERIODS if irregular else GAP_PERIODS) * period)
@@ -252,7 +261,7 @@ def with_common_period(parts: list[RawEpisode], note: Note) -> tuple[list[RawEpi
     Raises:
         RecordingError: a file has no such part.
     """
-    periods = np.array([np.median(np.diff(part.time)) for part in parts])
+    periods = np.array([part.period for part in parts])
     order = np.argsort(periods)
     rows = np.cumsum([len(parts[index].time) for index in order])
     period = float(periods[order][np.searchsorted(rows, rows[-1] / 2)])

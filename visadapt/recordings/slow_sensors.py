@@ -101,9 +101,9 @@ def with_empty_cells(raw: RawEpisode, system: System, note: Note) -> RawEpisode:
     sparse = (missing.sum(0) >= FEWEST_EMPTY) & ~missing.all(0)
     if not sparse.any():
         return raw
-    names = ", ".join(name for name, few in zip(raw.measured, sparse, strict=True) if few)
-    some = int(missing[:, sparse].any(1).sum())
-    note(f"{names}: cells are empty in {some} of {len(missing)} rows: not read there", raw.origin)
+    counts = zip(raw.measured, missing.sum(0).tolist(), sparse, strict=True)
+    of = ", ".join(f"{name} in {count}" for name, count, few in counts if few)
+    note(f"cells are empty, of {of} of {len(missing)} rows: not read there", raw.origin)
     return with_usable(raw, ~(missing & sparse), system)
 
 
