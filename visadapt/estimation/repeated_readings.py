@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from visadapt.estimation.segments import resolutions
+from visadapt.estimation.segments import interpolated, resolutions
 
 MIN_JUMP_STEPS, MIN_OTHER_STEPS = 8, 1.5
 """For a run of equal readings to count as repeated, the larger of the two changes into and out of it must exceed
@@ -32,7 +32,7 @@ NEAR_STEPS, NEAR_SHARE = 4.0, 0.2
 """Changes up to this many steps, or up to this share of the median change, from which the frequency of changes of less
 than one step is estimated."""
 
-LEAST_FROZEN = 0.3  # Share of the angles in the zone where a sensor stands still that are read as the one before
+LEAST_FROZEN = 0.5  # Share of the angles in the zone where a sensor stands still that are read as the one before
 
 ZONE_EDGE_POINTS = 120  # Angles tried for either edge of the zone in which the angle sensor stands still
 
@@ -105,16 +105,21 @@ def find_repeats(
 
 
 def _lie_in_a_zone(angles: Sequence[Tensor], frozen: Sequence[Tensor]) -> bool:
-    """Whether most of the angles (T,) of episodes between those that are `frozen` are frozen too; else the sensor misses
-    readings, whatever the angle is."""
-    angle, held = torch.cat([*angles]), torch.cat([*frozen])
+    """Whether most of the angles (T,) of episodes between those that the readings around the `frozen` ones show are
+    frozen too; else the sensor misses readings, whatever the angle is."""
+    held = torch.cat([*frozen])
     if not bool(held.any()):
         return False
+    true = [
+        interpolated(angle[:, None], (~still).double()[:, None], torch.arange(len(angle)).double())[:, 0]
+        for angle, still in zip(angles, frozen, strict=True)
+    ]
+    angle = torch.cat(true)
     # Whole turns apart or not.
     centre = torch.atan2(angle[held].sin().mean(), angle[held].cos().mean())
     angle = torch.atan2((angle - centre).sin(), (angle - centre).cos())
-    between = (angle >= angle[held].min()) & (angle <= angle[held].max())
-    return float(held[between].double().mean()) > LEAST_FROZEN
+    low, high = angle[held].quantile(torch.tensor([0.05, 0.95]).to(angle))
+    return float(held[(angle >= low) & (angle <= high)].double().mean()) > LEAST_FROZEN
 
 
 def _between_held(angles: Sequence[Tensor], frozen: Sequence[Tensor]) -> list[Tensor]:

@@ -168,7 +168,7 @@ def check_steps(episodes: Sequence[RawEpisode], system: System) -> None:
             + (slower if period > longest else "")
         )
     for raw, own in zip(episodes, steps, strict=True):
-        if len(own) and own.min() < LEAST_STEP_PERIODS * period:
+        if len(own) and raw.usable is None and own.min() < LEAST_STEP_PERIODS * period:
             row = int(own.argmin()) + 1
             raise RecordingError(
                 f"{raw.cell(row, 'time')}: only {own.min():.3g} s after the row before, where most are {period:.4g} s "
