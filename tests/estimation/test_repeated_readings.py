@@ -63,6 +63,32 @@ def test_an_angle_that_stands_still_in_a_zone_of_an_encoder_is_found():
     assert int((frozen & ~found).sum()) <= 0.1 * int(frozen.sum())
 
 
+def beside_a_slow_position(values, repeated):
+    """What is found where these rows of the angle repeat the one before, and the position is read in every third row
+    and, with the angle, where that is not repeated."""
+    usable = torch.ones_like(values)
+    usable[:, 0] = torch.arange(len(values)) % 3 == 0
+    return find_repeats([with_repeats(values, repeated, [1])], (0, 2), ANGLE, [usable])
+
+
+def test_a_zone_is_found_beside_a_slow_position():
+    values = moving()
+    frozen = (values[:, 1] > 0.02) & (values[:, 1] < 0.05)
+    frozen[0] = False
+    found = beside_a_slow_position(values, frozen)
+    assert not bool(found.lost[0].any())
+    assert int((frozen & ~found.frozen[0]).sum()) <= 0.1 * int(frozen.sum())
+
+
+def test_lost_rows_are_found_beside_a_slow_position():
+    values = moving()
+    lost = torch.rand(len(values), generator=torch.Generator().manual_seed(1)) < 0.15
+    lost[::3] = False  # no new position is read in a row that is lost
+    found = beside_a_slow_position(values, lost)
+    assert not bool(found.frozen[0].any())
+    assert int((lost & ~found.lost[0]).sum()) <= 0.1 * int(lost.sum())
+
+
 @pytest.mark.parametrize("rate", [0.1, 0.3])
 def test_an_angle_that_is_missed_now_and_then_stands_still_in_no_zone(rate):
     values = moving()

@@ -84,13 +84,13 @@ def find_repeats(
     if angle is not None:
         alone = [each[:, angle] & ~whole & ~rest for each, whole, rest in zip(same, whole_rows, resting, strict=True)]
         frozen = _unless_by_chance(alone, by_chance[angle])
-        if not _lie_in_a_zone([values[:, angle] for values in measured], frozen):
-            frozen, missed = missed, frozen
         if any(bool(still.any()) for still in frozen):
             # What a sensor slower than the rows might have shown in a row is unknown.
             unknown = [row & ~twice.all(1) for row, twice in zip(lost, both, strict=True)]
             frozen = [still | row for still, row in zip(frozen, unknown, strict=True)]
             lost = [row & ~other for row, other in zip(lost, unknown, strict=True)]
+        if not _lie_in_a_zone([values[:, angle] for values in measured], frozen):
+            frozen, missed = missed, frozen
     used = []
     doubtful = frozen if angle is None else _between_held([values[:, angle] for values in measured], frozen)
     for whole, still, apart in zip(lost, doubtful, missed, strict=True):
