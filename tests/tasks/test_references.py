@@ -214,7 +214,10 @@ GOOD = table_of(np.arange(0, 1.05, 0.1), circle(np.arange(0, 1.05, 0.1))[0])
         (lambda text: text.replace("time,", "t,"), r"has no column 'time'; its columns are t, x, y, z"),
         (lambda text: text.replace("z\n", "height\n"), "has no column 'z'"),
         (lambda text: text.replace("z\n", "x_dot\n"), "has no column 'z'"),
-        (lambda text: text.replace("\n0.3,", "\nnan,"), r"row 4 \(line 5\), column 'time' is nan; a finite number"),
+        (
+            lambda text: text.replace("\n0.3,", "\nnan,"),
+            r"row 4 \(line 5\), column 'time' is empty or nan; a finite number",
+        ),
         (
             lambda text: text.replace("\n0.3,", "\n0.1,"),
             r"row 4 \(line 5\), column 'time': the clock runs backward \(from 0.2",

@@ -52,10 +52,9 @@ def without_outliers(raw: RawEpisode, system: System, note: Note) -> RawEpisode:
         return raw
     bad = np.zeros(len(raw.time), bool)
     for name in raw.measured:
-        variable = variable_of(system, name)
-        if variable.unit == "1":  # as a quaternion's, whose sign may change
+        variable, rows = variable_of(system, name), raw.read(name)
+        if variable.unit == "1" or len(rows) < FROZEN_ROWS:  # a quaternion's sign may change
             continue
-        rows = raw.read(name)
         values = raw.states[name][rows]
         rate = system.rate_of(name)
         allowed = variable.largest

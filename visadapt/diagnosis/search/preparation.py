@@ -159,14 +159,17 @@ class _Readings:
             time, command, state, used = (values[first:] for values in rows)
             action, filled = command_sign * command, sign * smoothly_filled(state, used, time)
             kept = _without_long_runs((used > 0).all(1).numpy())
-            if slowest is not None:
-                read = used[:, slowest].nonzero()[:, 0]
+            read = used[:, slowest or 0].nonzero()[:, 0]
+            if slowest is not None and len(read) > 1:
                 time, action, filled = time[read], means_until_next(action, time, read), filled[read]
                 kept = np.ones(len(read), bool)
             episodes.append(Episode(time.numpy(), action.numpy(), filled.numpy()))
             usable.append(np.repeat(kept[:, None], len(self.channels), 1))
-        period = float(torch.cat([torch.from_numpy(episode.time).diff() for episode in episodes]).median())
-        return replace(self.recording, episodes=tuple(episodes), usable=tuple(usable), period=period)
+        whole = replace(self.recording, episodes=tuple(episodes), usable=tuple(usable))
+        if slowest is None:
+            return whole
+        steps = torch.cat([torch.from_numpy(episode.time).diff() for episode in episodes])
+        return replace(whole, period=float(steps.median()))
 
 
 def _with_unmeasured(rows: Segments, raw: Segments, system: System) -> tuple[Segments, Segments]:
