@@ -216,7 +216,7 @@ GOOD = table_of(np.arange(0, 1.05, 0.1), circle(np.arange(0, 1.05, 0.1))[0])
         (lambda text: text.replace("z\n", "x_dot\n"), "has no column 'z'"),
         (
             lambda text: text.replace("\n0.3,", "\nnan,"),
-            r"row 4 \(line 5\), column 'time' is empty or nan; a finite number",
+            r"row 4 \(line 5\), column 'time' is empty or nan",
         ),
         (
             lambda text: text.replace("\n0.3,", "\n0.1,"),
