@@ -7,7 +7,7 @@ from visadapt.diagnosis.next_experiment import explain, separate
 from visadapt.diagnosis.result import AMBIGUOUS, Cause
 from visadapt.diagnosis.search.causes import Alternative
 from visadapt.diagnosis.search.unexplained import SmoothFunction
-from visadapt.diagnosis.verdict import next_step
+from visadapt.diagnosis.verdict import next_step, of_many
 from visadapt.effects import (
     ActuatorBias,
     Brightness,
@@ -111,3 +111,9 @@ def test_variables_on_which_it_may_depend_as_well_are_named_beside_the_first():
         SmoothFunction("pivot", False, "time", 4.0),
     ]
     assert explain([first, *others]).startswith("An unexplained load (pivot) depends on previous command or command:")
+
+
+def test_many_causes_at_once_are_doubted():
+    assert of_many(3) == []
+    (said,) = of_many(5)
+    assert said.startswith("5 causes at once may stand for one effect that is not in the catalogue")

@@ -40,6 +40,7 @@ from visadapt.diagnosis.verdict import (
     late_by_less_than,
     left_unexplained,
     next_step,
+    of_many,
     one_by_one,
     shown_by_episodes,
 )
@@ -238,6 +239,7 @@ def _warnings(answered: Answer, origin: str) -> Iterator[str]:
         if bare > MAX_UNCHANGED and not explored.repeats:
             yield f"the unchanged simulator has a probability of {bare:.2f}: that there is a gap at all is not certain"
     carrying = {cause.effect for cause in without_slight(found)}
+    yield from of_many(sum(effect.name in carrying for effect in comparison.best.effects))
     yield from (f"{one.name}: {one.caveat}" for one in comparison.best.effects if one.caveat and one.name in carrying)
 
 

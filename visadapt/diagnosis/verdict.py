@@ -202,6 +202,19 @@ def late_by_less_than(row: float, found: Sequence[Cause]) -> list[str]:
     ]
 
 
+MANY = 4  # Causes at once from which on they are doubted
+
+
+def of_many(causes: int) -> list[str]:
+    """A warning of so many causes that carry the explanation: each adds its freedom to imitate another effect."""
+    if causes < MANY:
+        return []
+    return [
+        f"{causes} causes at once may stand for one effect that is not in the catalogue: see whether they keep their "
+        "values in another recording, at other speeds"
+    ]
+
+
 def hovers(search: Search, comparison: ModelComparison, found: Sequence[Cause]) -> list[str]:
     """A warning where drag or wind is found, and the vehicle hardly moves."""
     named = [cause.effect for cause in without_slight(found) if issubclass(EFFECTS.get(cause.effect, Effect), AIR)]
