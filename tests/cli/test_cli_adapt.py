@@ -116,12 +116,12 @@ def test_without_a_gap_the_policy_is_left_as_it_is(here, capsys):
 
 
 def test_under_a_late_motor_the_policy_stays_what_it_was_and_the_tuned_one_is_kept(here, capsys):
-    (here / "late.py").write_text(
+    (here / "late_motor.py").write_text(
         "import visadapt as va\n\n\ndef target():\n"
         "    return va.SyntheticTarget(lambda batch, generator: [va.effects.ActuatorDelay(delay=0.05)])\n"
     )
     samples = ("--samples", 120, "--round", 30, "--iterations", 100, "--out", "run")
-    assert run("adapt", "--policy", SHIPPED, "--target", "late:target", *samples) == 0
+    assert run("adapt", "--policy", SHIPPED, "--target", "late_motor:target", *samples) == 0
     said = capsys.readouterr().out
     assert "as, since the tuned one, run/tuned.safetensors, was worse: " in said
     assert "of its episodes on the machine ended early" in said

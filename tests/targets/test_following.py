@@ -69,8 +69,8 @@ def test_the_command_line_gives_references_to_a_target_without_a_goal(tmp_path, 
     header = "time,x,y,z,x_dot,y_dot,z_dot"
     lines = (",".join(f"{cell:.9g}" for cell in row) for row in rows.tolist())
     (tmp_path / "course.csv").write_text("\n".join((header, *lines)) + "\n")
-    (tmp_path / "rig.py").write_text("from tests.targets.test_following import Machine as make\n")
-    flown = ("--policy", va.shipped("quadrotor"), "--target", "rig:make")
+    (tmp_path / "bare_quadrotor.py").write_text("from tests.targets.test_following import Machine as make\n")
+    flown = ("--policy", va.shipped("quadrotor"), "--target", "bare_quadrotor:make")
     assert "the target has none: give it references" in refused(capsys, "score", *flown)
     course = ("--references", "course.csv")
     assert command("score", *flown, *course, "--episodes", 1) == 0
