@@ -44,8 +44,9 @@ def load_policy_and_target(options: argparse.Namespace) -> tuple[Policy, World, 
 
 def _has_goal(target: Target) -> bool:
     """Whether a target shows a goal of its own. A reset is no step: it is not counted."""
-    shown = target.reset(1, torch.Generator().manual_seed(0))
-    return isinstance(target, TaskTarget) or getattr(shown, "goal", None) is not None
+    if isinstance(target, TaskTarget):
+        return True
+    return getattr(target.reset(1, torch.Generator().manual_seed(0)), "goal", None) is not None
 
 
 def load_policy_and_source(options: argparse.Namespace) -> tuple[Policy, World]:

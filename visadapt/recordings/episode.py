@@ -75,10 +75,10 @@ class Episode:
         """Executed actions: what the ledger counts."""
         return len(self.time) - 1
 
-    def first(self, rows: int) -> Episode:
-        """Its first `rows`."""
+    def part(self, rows: slice) -> Episode:
+        """Some of its rows; times still count from its start."""
         arrays = {each.name: getattr(self, each.name) for each in fields(self)}
-        return replace(self, **{name: values[:rows] for name, values in arrays.items() if values is not None})
+        return replace(self, **{name: values[rows] for name, values in arrays.items() if values is not None})
 
 
 @dataclass(frozen=True)

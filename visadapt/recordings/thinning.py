@@ -47,9 +47,7 @@ def spread(recording: Recording, most: int, length: int, before: int) -> Recordi
     episodes, sources, usable = [], [], []
     for number, own in chosen:
         episode, led = recording.episodes[number], slice(max(0, own.start - before), own.stop)
-        assert episode.state is not None
-        time, action, state = episode.time[led], episode.action[led], episode.state[led]
-        episodes.append(replace(episode, time=time, action=action, state=state, task_state=None))
+        episodes.append(replace(episode.part(led), task_state=None))
         sources.append(f"{recording.sources[number]}{FROM}{episode.time[own.start]:.1f} s")
         usable.append(every[number][led] & (np.arange(led.start, led.stop) >= own.start)[:, None])
     used = sum(own.stop - own.start for _, own in chosen)

@@ -42,9 +42,9 @@ def without_idle_ends(recording: Recording, system: System) -> Recording:
     for number, (episode, source) in enumerate(zip(recording.episodes, recording.sources, strict=True)):
         motion = motion_of(episode, world, measured, recording.period)
         off = None if motion is None else _off_from(motion)
-        count = len(episode.time) if off is None else int(np.searchsorted(episode.time, off))
-        episodes.append(episode.first(count))
-        usable += [recording.usable[number][:count]] if recording.usable else []
+        rows = slice(None if off is None else int(np.searchsorted(episode.time, off)))
+        episodes.append(episode.part(rows))
+        usable += [recording.usable[number][rows]] if recording.usable else []
         if off is not None:
             told.append(
                 f"{source}: from {off:.3g} s on its commands do not act, as where a motor is switched off or the "

@@ -159,8 +159,8 @@ class _Readings:
             time, command, state, used = (values[first:] for values in rows)
             action, filled = command_sign * command, sign * smoothly_filled(state, used, time)
             kept = _without_long_runs((used > 0).all(1).numpy())
-            read = used[:, slowest or 0].nonzero()[:, 0]
-            if slowest is not None and len(read) > 1:
+            read = None if slowest is None else used[:, slowest].nonzero()[:, 0]
+            if read is not None and len(read) > 1:
                 time, action, filled = time[read], means_until_next(action, time, read), filled[read]
                 kept = np.ones(len(read), bool)
             episodes.append(Episode(time.numpy(), action.numpy(), filled.numpy()))

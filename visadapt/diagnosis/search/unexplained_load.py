@@ -152,9 +152,7 @@ def _measured(episode: Episode, usable: NDArray[np.bool_] | None) -> Iterator[Ep
     whole = np.logical_and.reduce(usable, axis=1)
     for start, end in runs(whole):
         if whole[start] and end - start > 1:
-            rows = slice(start, end)
-            assert episode.state is not None
-            yield Episode(episode.time[rows], episode.action[rows], episode.state[rows])
+            yield episode.part(slice(start, end))
 
 
 def _track(
