@@ -124,7 +124,8 @@ def jumps(raw: RawEpisode, system: System, note: Note) -> list[int]:
         nearest = others[:, AROUND_JUMP - 2 : AROUND_JUMP + 2].mean(1)
         departs = steps - lasting * nearest
         size = np.abs(departs)
-        usual = JUMP_SCALES * DEVIATION_PER_MEDIAN * float(np.median(size))
+        moved = size[size > 0]  # a dead sensor's readings are all equal
+        usual = JUMP_SCALES * DEVIATION_PER_MEDIAN * float(np.median(moved)) if len(moved) else 0.0
         jump = size > np.maximum(usual, JUMP_RATIO * lasting * np.abs(others).max(1))
         jump[1:] &= steps[:-1] != 0  # a sensor that stood still, which an effect of the catalogue does, then jumps
         for step in (np.flatnonzero(jump[AROUND_JUMP:-AROUND_JUMP]) + AROUND_JUMP).tolist():

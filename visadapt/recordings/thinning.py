@@ -8,7 +8,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from visadapt.recordings.episode import FROM, Recording
+from visadapt.recordings.episode import Recording
+from visadapt.recordings.stretches import stretches_of
 
 STRETCH = 5000  # Rows of a file that are kept or left out together
 
@@ -30,9 +31,8 @@ def kept(first: int, last: int, every: int) -> NDArray[np.bool_]:
 def spread(recording: Recording, most: int, length: int, before: int) -> Recording:
     """A recording of at most about `most` usable rows: stretches of about `length`, spread evenly over it.
 
-    Each stretch becomes an episode, whose times still count from the start of the episode that it is cut from. It is
-    led by up to `before` earlier rows, marked as not usable: their commands are needed, since a late motor still acts
-    on them. A warning says what is used.
+    Each stretch becomes an episode, led by up to `before` rows of which the commands alone are used (`stretches_of`).
+    A warning says what is used.
     """
     rows = [len(episode.time) for episode in recording.episodes]
     if sum(rows) <= most:
@@ -43,22 +43,9 @@ def spread(recording: Recording, most: int, length: int, before: int) -> Recordi
         stretches += [(number, slice(*pair)) for pair in pairwise(edges)]
     count = max(1, most * len(stretches) // sum(rows))
     chosen = [stretches[k] for k in np.linspace(0, len(stretches) - 1, count).round().astype(int)]
-    every = recording.usable or [np.ones((own, len(recording.measured)), bool) for own in rows]
-    episodes, sources, usable = [], [], []
-    for number, own in chosen:
-        episode, led = recording.episodes[number], slice(max(0, own.start - before), own.stop)
-        episodes.append(replace(episode.part(led), task_state=None))
-        sources.append(f"{recording.sources[number]}{FROM}{episode.time[own.start]:.1f} s")
-        usable.append(every[number][led] & (np.arange(led.start, led.stop) >= own.start)[:, None])
     used = sum(own.stop - own.start for _, own in chosen)
-    return replace(
-        recording,
-        episodes=tuple(episodes),
-        sources=tuple(sources),
-        usable=tuple(usable),
-        warnings=(
-            *recording.warnings,
-            f"{sum(rows):,} rows are more than a diagnosis looks at: {used:,} of them were used, in {count} stretches "
-            "spread evenly over the recording",
-        ),
+    told = (
+        f"{sum(rows):,} rows are more than a diagnosis looks at: {used:,} of them were used, in {count} stretches "
+        "spread evenly over the recording"
     )
+    return replace(stretches_of(recording, chosen, before), warnings=(*recording.warnings, told))

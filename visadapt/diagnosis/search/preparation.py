@@ -12,6 +12,7 @@ from torch import Tensor
 
 from visadapt.diagnosis.result import Push
 from visadapt.diagnosis.search import angle_defect, sensor_checks, sign_conventions
+from visadapt.diagnosis.search.held_joints import without_held_joints
 from visadapt.diagnosis.search.motor_off import without_idle_ends
 from visadapt.diagnosis.search.pushed_rows import pushed_rows
 from visadapt.diagnosis.search.search import Search
@@ -72,17 +73,13 @@ already, and the time grows with the rows. Of a longer recording, stretches of S
 
 
 def limited(recording: Recording, system: System) -> Recording:
-    """The recording as far as its commands act; where it has more rows than a diagnosis uses, stretches that are spread
-    evenly over it."""
-    recording = without_idle_ends(recording, system)
+    """The recording without rows in which its commands do not act, or a joint is held; where it has more rows than a
+    diagnosis uses, stretches that are spread evenly over it."""
+    before = round(MEMORY * system.prediction_time / recording.period)
+    recording = without_idle_ends(without_held_joints(recording, system, before), system)
     profile = profile_of(system)
     stretch = STRETCH_WINDOWS * max(profile.window_rows, round(system.prediction_time / recording.period))
-    return spread(
-        recording,
-        MOST_SEARCHES * profile.search_rows,
-        stretch,
-        round(MEMORY * system.prediction_time / recording.period),
-    )
+    return spread(recording, MOST_SEARCHES * profile.search_rows, stretch, before)
 
 
 def prepare(
