@@ -22,7 +22,8 @@ def balanced(effects=(), seed=0, resting=None, stop=0.4):
     """A cart-pole under feedback, whose motor is off in the rows `resting`, in which the pole falls on a stop; whoever
     then puts it upright lets go of it at rest."""
     world = World(CartPole(), [effect.double() for effect in effects], period=PERIOD, substeps=4)
-    rng, now, rows, dither = np.random.default_rng(seed), world.start(torch.tensor([[0.1, 0, 0.02, 0]]).double()), [], 0
+    rng, rows, dither = np.random.default_rng(seed), [], 0.0
+    now = world.start(torch.tensor([[0.1, 0, 0.02, 0]]).double())
     for row in range(ROWS):
         if row % 5 == 0:
             dither = rng.uniform(-0.1, 0.1)
@@ -32,10 +33,8 @@ def balanced(effects=(), seed=0, resting=None, stop=0.4):
         with torch.no_grad():
             now = world.step(now, torch.tensor([[command]]).double())
         if off and abs(float(now.state[0, 2])) > stop:
-            state = now.state.clone()
-            state[0, 2:] = torch.stack((state[0, 2].sign() * stop, torch.zeros(()).double()))
-            state[0, 1] = 0.0
-            now = replace(now, state=state)
+            x, _, theta, _ = now.state[0].tolist()
+            now = replace(now, state=torch.tensor([[x, 0.0, np.sign(theta) * stop, 0.0]]).double())
         if resting is not None and row == resting[1] - 1:
             now = replace(now, state=torch.tensor([[float(now.state[0, 0]), 0, 0.01, 0]]).double())
     table = np.array(rows)

@@ -65,6 +65,11 @@ class _Joint:
         """The system's prediction time in s."""
         return self.motion.world.system.prediction_time
 
+    @property
+    def readings(self) -> NDArray[np.float64]:
+        """(rows,) of its position, or where it has none of its velocity."""
+        return np.asarray(self.episode.state, np.float64)[:, self.read]
+
     @cached_property
     def velocity(self) -> Tensor:
         """(T,) smoothed."""
@@ -108,7 +113,7 @@ class _Joint:
 
     def repeated(self) -> Iterator[_Held]:
         """The run of equal readings of a dead sensor."""
-        values = np.asarray(self.episode.state)[:, self.read]
+        values = self.readings
         lasting = sorted(runs(values), key=lambda run: run[0] - run[1])
         first, last = lasting[0]
         second = lasting[1][1] - lasting[1][0] if len(lasting) > 1 else 0
@@ -157,7 +162,7 @@ class _Joint:
         system, time = self.motion.world.system, self.motion.time
         position, velocity = system.coordinates[self.index]
         state = system.states[velocity if position is None else position]
-        reading = float(np.interp(float(time[held.first]), self.episode.time, self.episode.state[:, self.read]))
+        reading = float(np.interp(float(time[held.first]), self.episode.time, self.readings))
         needed = f"though {self.load(held):.2g} {system.loads[self.index].unit} would move it"
         what = (
             f"reads {reading:.4g} {state.unit} in each row, {needed}: its sensor is dead, or it is held"
