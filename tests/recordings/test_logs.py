@@ -108,6 +108,37 @@ def test_rows_before_the_first_command_that_is_a_number_are_left_out(tmp_path):
     assert "18 rows in which a number is missing are left out" in " ".join(found.warnings)
 
 
+def test_a_joint_is_found_by_its_name(tmp_path):
+    path = ros_bag(tmp_path / "run", 2, stamped=False)
+    names = {"x": "/joint_states.position[cart]", "theta": "/joint_states.position[pole]", "command": ROS["command"]}
+    (by_number,), (by_name,) = (load_recording(path, CartPole(), given).episodes for given in (ROS, names))
+    np.testing.assert_array_equal(by_number.state[:, [0, 2]], by_name.state)
+
+
+def test_joints_in_another_order_are_told_by_name_alone(tmp_path):
+    store = get_typestore(Stores.LATEST)
+    make, kinds = store.types, {"/joints": "sensor_msgs/msg/JointState", "/u": "std_msgs/msg/Float64"}
+    with rosbag2.Writer(tmp_path / "run", version=9) as writer:
+        connections = {topic: writer.add_connection(topic, kind, typestore=store) for topic, kind in kinds.items()}
+        for row in range(60):
+            time = make["builtin_interfaces/msg/Time"](1 + row // 20, 50_000_000 * (row % 20))
+            names, values = ["cart", "pole"], np.array([0.01 * row, -0.02 * row])
+            if row % 2:
+                names, values = names[::-1], values[::-1].copy()
+            header = make["std_msgs/msg/Header"](time, "")
+            joints = make["sensor_msgs/msg/JointState"](header, names, values, np.zeros(0), np.zeros(0))
+            for topic, message in (("/joints", joints), ("/u", make["std_msgs/msg/Float64"](0.1))):
+                raw = store.serialize_cdr(message, kinds[topic])
+                writer.write(connections[topic], 10**9 + 50_000_000 * row, raw)
+    given = {"x": "/joints.position[cart]", "theta": "/joints.position[pole]", "command": "/u.data"}
+    (episode,) = load_recording(tmp_path / "run", CartPole(), given).episodes
+    np.testing.assert_allclose(episode.state[:, 1], -2 * episode.state[:, 0], atol=1e-12)
+    with pytest.raises(
+        RecordingError, match=r"/joints names the joints cart, pole, later pole, cart.*position\[cart\]"
+    ):
+        load_recording(tmp_path / "run", CartPole(), given | {"x": "/joints.position[0]"})
+
+
 @pytest.mark.parametrize("turned", [False, True])
 def test_a_bag_and_the_file_in_it_count_once(turned, tmp_path):
     path = ros_bag(tmp_path / "run", 2, stamped=False)
@@ -131,6 +162,7 @@ def test_the_slower_topic_is_not_the_one_that_ends_first_and_what_is_cut_off_is_
         ({"x": "/joints.position[0]"}, "has no topic '/joints'; it has /joint_states, /motor/command"),
         ({"x": "/joint_states.place[0]"}, "'place' there are effort, header, name, position, velocity"),
         ({"x": "/joint_states.position[7]"}, r"no 'position\[7\]': at '\[7\]' there are 2 values"),
+        ({"x": "/joint_states.position[wheel]"}, r"no 'position\[wheel\]': its message names cart, pole"),
         ({"x": "/joint_states.name[0]"}, "is no number but a str"),
         ({"x": "/joint_states.position[0][1]"}, r"no 'position\[0\]\[1\]': at '\[1\]' there is a float"),
         ({"x": "position"}, "the column 'position' is not of the form TOPIC.FIELD"),

@@ -97,6 +97,7 @@ def _read_bag(path: Path, wanted: Mapping[str, set[str]]) -> dict[str, Topic]:
     highlevel, stores = _import(path, "rosbags.highlevel"), _import(path, "rosbags.typesys")
     fields = {name: sorted(each) for name, each in wanted.items()}
     rows: dict[str, list[list[float]]] = {name: [] for name in wanted}
+    joints: dict[str, list[str]] = {}
     with highlevel.AnyReader([path], default_typestore=stores.get_typestore(stores.Stores.LATEST)) as bag:
         for name in wanted:
             _check(path, name, {each.topic for each in bag.connections})
@@ -109,6 +110,7 @@ def _read_bag(path: Path, wanted: Mapping[str, set[str]]) -> dict[str, Topic]:
                     f"{path}: the bag does not define {connection.msgtype}, the type of {name}; a bag of ROS 2 "
                     "Iron or later, which stores definitions, or a standard type is right"
                 ) from None
+            _check_order(path, joints.setdefault(name, _joints(message)), message, name, fields[name])
             numbers = [_number(path, message, name, field) for field in fields[name]]
             header = getattr(getattr(message, "header", None), "stamp", None)
             written = 0.0 if header is None else header.sec + 1e-9 * header.nanosec
@@ -135,12 +137,41 @@ def _topic(table: NDArray[np.float64], fields: Sequence[str], by_header: bool) -
     return Topic(table[kept, int(by_header)], dict(zip(fields, table[kept, 2:].T, strict=True)), tuple(notes))
 
 
+def _joints(message: Any) -> list[str]:
+    """The joints that a message such as a JointState names, in the order of its numbers."""
+    names = getattr(message, "name", None)
+    return [str(each) for each in names] if isinstance(names, (list, tuple)) else []
+
+
+def _check_order(path: Path, first: Sequence[str], message: Any, topic: str, fields: Iterable[str]) -> None:
+    """Raises RecordingError where fields say joints by number, and a message names them in another order than the
+    `first` one did."""
+    by_number = [field for field in fields if re.search(r"\[\d+\]", field)]
+    if by_number and (joints := _joints(message)) != first:
+        field = by_number[0].partition("[")[0]
+        raise RecordingError(
+            f"{path}: {topic} names the joints {_listed(first)}, later {_listed(joints)}: {by_number[0]} is not always "
+            f"the same; {field}[{(first or joints)[0]}] is right, with the name of the joint"
+        )
+
+
+def _listed(joints: Sequence[str]) -> str:
+    return ", ".join(joints) or "(none)"
+
+
 def _number(path: Path, message: Any, topic: str, field: str) -> float:
-    """The number in a field such as pose.position.x or position[0]."""
+    """The number in a field such as pose.position.x, position[0], or position[elbow], of a joint that is named."""
     value = message
-    for part in re.findall(r"\w+|\[\d+\]", field):
+    for part in re.findall(r"[^.\[\]]+|\[[^\[\]]+\]", field):
         try:
-            value = value[int(part[1:-1])] if part.startswith("[") else getattr(value, part)
+            if not part.startswith("["):
+                value = getattr(value, part)
+            elif (index := part[1:-1]).isdecimal():
+                value = value[int(index)]
+            elif index in (joints := _joints(message)):
+                value = value[joints.index(index)]
+            else:
+                raise RecordingError(f"{path}: {topic} has no {field!r}: its message names {_listed(joints)}")
         except (AttributeError, IndexError, TypeError):
             if names := getattr(value, "__dataclass_fields__", None):
                 there = f"are {_some(set(names) - {'__msgtype__'})}"
