@@ -89,8 +89,8 @@ class _Joint:
         return torch.stack((-velocity.sign(), velocity, position, torch.ones_like(velocity)), 1)
 
     def moving(self) -> Tensor:
-        """(T,) whether it is about as fast as usual: what it needs while slower, friction may be."""
-        return self.velocity.abs() >= self.velocity.abs().median() / 2
+        """(T,) whether it is known to be as fast as usual: what it needs while slower, friction may be."""
+        return (self.velocity.abs() >= self.velocity.abs().nanmedian() / 2) & self.needed.isfinite()
 
     @cached_property
     def freed(self) -> Tensor:

@@ -96,8 +96,8 @@ class Motion:
         return replace(bare, **parameters).response_to_loads(self.state, self.acting, load)
 
     def loads(self, acceleration: Tensor) -> Tensor:
-        """Loads (T, J) that give the joints of the world an acceleration (T, J)."""
-        return torch.linalg.solve(self.by_world[1], acceleration[..., None])[..., 0]
+        """Loads (T, J) that give the joints of the world an acceleration (T, J); not finite where none would."""
+        return torch.linalg.solve_ex(self.by_world[1], acceleration[..., None])[0][..., 0]
 
     def dry_friction(self) -> Tensor:
         """(T, J) the dry friction of the world at rest: half of the jump of its load where a joint turns round."""
