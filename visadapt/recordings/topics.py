@@ -97,6 +97,7 @@ def _read_bag(path: Path, wanted: Mapping[str, set[str]]) -> dict[str, Topic]:
     highlevel, stores = _import(path, "rosbags.highlevel"), _import(path, "rosbags.typesys")
     fields = {name: sorted(each) for name, each in wanted.items()}
     rows: dict[str, list[list[float]]] = {name: [] for name in wanted}
+    by_number = {name: [field for field in each if re.search(r"\[\d+\]", field)] for name, each in fields.items()}
     joints: dict[str, list[str]] = {}
     with highlevel.AnyReader([path], default_typestore=stores.get_typestore(stores.Stores.LATEST)) as bag:
         for name in wanted:
@@ -110,7 +111,8 @@ def _read_bag(path: Path, wanted: Mapping[str, set[str]]) -> dict[str, Topic]:
                     f"{path}: the bag does not define {connection.msgtype}, the type of {name}; a bag of ROS 2 "
                     "Iron or later, which stores definitions, or a standard type is right"
                 ) from None
-            _check_order(path, joints.setdefault(name, _joints(message)), message, name, fields[name])
+            if by_number[name]:
+                _check_order(path, joints.setdefault(name, _joints(message)), message, name, by_number[name][0])
             numbers = [_number(path, message, name, field) for field in fields[name]]
             header = getattr(getattr(message, "header", None), "stamp", None)
             written = 0.0 if header is None else header.sec + 1e-9 * header.nanosec
@@ -143,15 +145,14 @@ def _joints(message: Any) -> list[str]:
     return [str(each) for each in names] if isinstance(names, (list, tuple)) else []
 
 
-def _check_order(path: Path, first: Sequence[str], message: Any, topic: str, fields: Iterable[str]) -> None:
-    """Raises RecordingError where fields say joints by number, and a message names them in another order than the
-    `first` one did."""
-    by_number = [field for field in fields if re.search(r"\[\d+\]", field)]
-    if by_number and (joints := _joints(message)) != first:
-        field = by_number[0].partition("[")[0]
+def _check_order(path: Path, first: Sequence[str], message: Any, topic: str, field: str) -> None:
+    """Raises RecordingError where a message names its joints in another order than the `first` one did: `field`, which
+    says one by its number, is then not always the same."""
+    if (joints := _joints(message)) != first:
+        by_name = f"{field.partition('[')[0]}[{(first or joints)[0]}]"
         raise RecordingError(
-            f"{path}: {topic} names the joints {_listed(first)}, later {_listed(joints)}: {by_number[0]} is not always "
-            f"the same; {field}[{(first or joints)[0]}] is right, with the name of the joint"
+            f"{path}: {topic} names the joints {_listed(first)}, later {_listed(joints)}: {field} is not always "
+            f"the same; {by_name} is right, with the name of the joint"
         )
 
 

@@ -16,13 +16,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from visadapt.diagnosis.search.inverse_dynamics import Motion, motion_of
-from visadapt.diagnosis.search.unexplained_load import has_joints, unread_states
+from visadapt.diagnosis.search.inverse_dynamics import Motion
+from visadapt.diagnosis.search.unexplained_load import bare_motions
 from visadapt.recordings import Episode, Recording
 from visadapt.recordings.runs import runs
 from visadapt.recordings.stretches import stretches_of
 from visadapt.systems import System
-from visadapt.world import World
 
 SHORTEST, SHORTEST_AT_END = 1.5, 1.0
 """Prediction times that a joint stands still, at least; and where it does so to the end of its episode."""
@@ -179,15 +178,12 @@ def without_held_joints(recording: Recording, system: System, before: int) -> Re
     Args:
         before: rows before each stretch that is kept whose commands are still used.
     """
-    if not has_joints(system) or unread_states(recording, system):
-        return recording
-    world, measured = World(system, (), recording.period).double(), [system.index(name) for name in recording.measured]
-    motions = [motion_of(episode, world, measured, recording.period) for episode in recording.episodes]
+    motions = bare_motions(recording, system)
     bad, told = [np.zeros(len(episode.time), bool) for episode in recording.episodes], []
     for index, (position, velocity) in enumerate(system.coordinates):
-        read = measured.index(velocity if position is None else position)
+        name = system.states[velocity if position is None else position].name
         joints = {
-            number: _Joint(motion, recording.episodes[number], index, read)
+            number: _Joint(motion, recording.episodes[number], index, recording.measured.index(name))
             for number, motion in enumerate(motions)
             if motion is not None
         }

@@ -11,11 +11,10 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from visadapt.diagnosis.search.inverse_dynamics import Motion, motion_of
-from visadapt.diagnosis.search.unexplained_load import has_joints, unread_states
+from visadapt.diagnosis.search.inverse_dynamics import Motion
+from visadapt.diagnosis.search.unexplained_load import bare_motions
 from visadapt.recordings import Recording
 from visadapt.systems import System
-from visadapt.world import World
 
 SHORTEST_OFF = 0.6  # Prediction times in which commands of such an end are stronger than usual, at least
 LATEST_START = 0.97
@@ -35,12 +34,12 @@ LEAST_RISE = 4.0
 
 def without_idle_ends(recording: Recording, system: System) -> Recording:
     """The recording with each episode up to where its commands no longer act; a warning says of which."""
-    if not has_joints(system) or unread_states(recording, system):
+    motions = bare_motions(recording, system)
+    if not motions:
         return recording
-    world, measured = World(system, (), recording.period).double(), [system.index(name) for name in recording.measured]
     episodes, usable, told = [], [], []
-    for number, (episode, source) in enumerate(zip(recording.episodes, recording.sources, strict=True)):
-        motion = motion_of(episode, world, measured, recording.period)
+    parts = zip(recording.episodes, recording.sources, motions, strict=True)
+    for number, (episode, source, motion) in enumerate(parts):
         off = None if motion is None else _off_from(motion)
         rows = slice(None if off is None else int(np.searchsorted(episode.time, off)))
         episodes.append(episode.part(rows))

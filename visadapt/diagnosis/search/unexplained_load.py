@@ -135,6 +135,15 @@ def has_joints(system: System) -> bool:
     return len(system.coordinates) == len(system.loads)
 
 
+def bare_motions(recording: Recording, system: System) -> list[Motion | None]:
+    """The motion of each episode in the bare system's world, None of one that is too short; none where `unread_states`
+    has any, or the system has no joints."""
+    if not has_joints(system) or unread_states(recording, system):
+        return []
+    world, measured = World(system, (), recording.period).double(), [system.index(name) for name in recording.measured]
+    return [motion_of(episode, world, measured, recording.period) for episode in recording.episodes]
+
+
 def _usual_size(load: Tensor) -> Tensor:
     """(J,) root mean square of loads (N, J), of which larger ones count as MOST_POWER says."""
     power = load.square()
