@@ -226,9 +226,18 @@ class FittedModels:
         """The best fit so far of a set, this one among them."""
         fitted = ScoredModel(effects, fits, log_posterior_odds(effects, fits, len(self.catalogue)))
         key = key_of(effects)
-        if key not in self.fitted or self.fitted[key].log_odds < fitted.log_odds:
+        if key not in self.fitted or _is_better(fitted, self.fitted[key]):
             self.fitted[key] = fitted
         return self.fitted[key]
+
+
+def _is_better(one: ScoredModel, other: ScoredModel) -> bool:
+    """Whether a fit is better than another one of the same set."""
+    if math.inf in (-one.log_odds, -other.log_odds):
+        # A likelier fit about which the recording is uninformative shows that the other one has stopped short of it.
+        gain = float(one.fits.likelihood[0] - other.fits.likelihood[0])
+        return gain > (MIN_BETTER if one.log_odds == -math.inf else -MIN_BETTER)
+    return one.log_odds > other.log_odds
 
 
 def key_of(effects: Effects) -> frozenset[str]:
