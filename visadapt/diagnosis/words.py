@@ -20,6 +20,8 @@ ONE_BY_ONE = "each recording is explained by itself, but not all together"
 
 A_ROW_LATE = "the commands were moved a row up"
 """What it warns of where each command was recorded a row late."""
+PART_LATE = "the commands were moved by that"
+"""What it warns of where the commands' stamps are late by part of a row."""
 
 OPPOSITE = " has the opposite sign of the source's"
 """What a diagnosis warns of, after the quantity's name, where it inverted a sign of the recording."""

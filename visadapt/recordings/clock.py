@@ -77,6 +77,8 @@ class RawEpisode:
     """(T, H, W), where frames are read in the place of states"""
     usable: NDArray[np.bool_] | None = None
     """(T, n_measured) which readings are measurements; without it, all are"""
+    stamped_commands: bool = False
+    """whether its commands had stamps of their own, by which they came into these rows"""
 
     @property
     def origin(self) -> str:

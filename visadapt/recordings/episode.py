@@ -108,6 +108,8 @@ class Recording:
     """(T, n_measured) for each episode, which readings are measurements; without it, all are"""
     resolution: tuple[float, ...] = ()
     """smallest meaningful difference of each measured state; without it, the smallest between two of its readings"""
+    stamped_commands: bool = False
+    """whether the commands had stamps of their own, by which they came into the rows"""
 
     def __post_init__(self) -> None:
         if not self.episodes:

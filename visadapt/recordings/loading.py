@@ -129,6 +129,7 @@ def load_recording(
             f"{where[0]}{f' and {len(where) - 1} more' if len(where) > 1 else ''}: {text}"
             for text, where in notes.items()
         ),
+        stamped_commands=all(part.stamped_commands for part in parts),
     )
 
 

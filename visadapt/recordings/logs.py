@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -30,6 +30,15 @@ MOST_DISPLACED = 10
 LEAST_KNOWN = 0.5
 """Share of the rows in which all numbers are known from which the others are left out: a column that has hardly any is
 named instead."""
+
+LEAST_STEADY = 20
+"""Intervals between messages from which on a steady clock is told from one that is not."""
+
+STEADY = "the clock's times are used"
+"""What a note says of messages that came late, each by a time of its own."""
+
+WORTH_SAYING_S = 1e-4
+"""Delays of messages above which these are worth a note."""
 
 GAP = 5.0
 """Longest interval between a topic's readings, in median intervals, that is interpolated; longer ones have no rows."""
@@ -56,6 +65,7 @@ def read_log(path: Path, read: Read, system: System, given: Mapping[str, str], n
     topics = {name: _in_order(path, name, topic, note) for name, topic in _topics(path, read, wanted).items()}
     log = _Log(path, system, columns, named, topics)
     log.check_messages()
+    log = log.with_steady_clocks(note)
     rows = log.rows(note)
     time = log.topics[log.slowest].time[rows]
     action = np.column_stack([log.command(one.name, time) for one in system.actions])
@@ -71,7 +81,17 @@ def read_log(path: Path, read: Read, system: System, given: Mapping[str, str], n
         return f"message {rows[row] + 1} of {log.slowest}"
 
     names = {name: ".".join(column) for name, column in columns.items()}
-    return RawEpisode(path, time - time[0], action[kept], states[kept], log.measured, message, names, given)
+    return RawEpisode(
+        path,
+        time - time[0],
+        action[kept],
+        states[kept],
+        log.measured,
+        message,
+        names,
+        given,
+        stamped_commands=True,
+    )
 
 
 def _topics(path: Path, read: Read, wanted: Mapping[str, set[str]]) -> dict[str, Topic]:
@@ -125,6 +145,16 @@ class _Log:
                 raise RecordingError(f"{self.path}: {name} has no messages")
             if len(stamps) < 2 and name in self.of_states:
                 raise RecordingError(f"{self.path}: {name} has a single message; readings all along are right")
+
+    def with_steady_clocks(self, note: Note) -> _Log:
+        """With the stamps of a steady clock for messages that were sent by one and received a little later each."""
+        topics = dict(self.topics)
+        for name, topic in self.topics.items():
+            if topic.as_received:
+                topics[name], late = _as_sent(topic)
+                if late > WORTH_SAYING_S:
+                    note(f"{name}: sent by a steady clock and received up to {late:.2g} s late: {STEADY}", str(self.path))
+        return replace(self, topics=topics)
 
     def rows(self, note: Note) -> NDArray[np.intp]:
         """The messages of the slowest topic (T,) for which all other topics have a value."""
@@ -192,7 +222,25 @@ def _in_order(path: Path, name: str, topic: Topic, note: Note) -> Topic:
             "is never set back, is right"
         )
     note(f"{name}: {(displaced > 0).sum()} messages are put in the order of their stamps", str(path))
-    return Topic(topic.time[order], {field: values[order] for field, values in topic.values.items()})
+    return replace(topic, time=topic.time[order], values={key: values[order] for key, values in topic.values.items()})
+
+
+def _as_sent(topic: Topic) -> tuple[Topic, float]:
+    """A topic with the stamps of the steady clock by which its messages were sent, and by how many s the latest of them
+    was received later than the promptest; as it is, and 0, where they were not. A delay of one message leaves the next
+    one where it was; a loop that sleeps between messages delays all that follow."""
+    steps = np.diff(topic.time)
+    period = float(np.median(steps)) if len(steps) >= LEAST_STEADY else 0.0
+    if period <= 0:
+        return topic, 0.0
+    periods = np.maximum(np.round(steps / period), 1)
+    number = np.concatenate(([0.0], np.cumsum(periods)))
+    slope, first = np.polyfit(number, topic.time - topic.time[0], 1)
+    late = topic.time - topic.time[0] - (slope * number + first)
+    sleeps = np.var(late) > np.var(steps - slope * periods)
+    if sleeps or np.ptp(late) >= period:
+        return topic, 0.0
+    return replace(topic, time=topic.time - (late - late.min())), float(np.ptp(late))
 
 
 def _whole(numbers: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -38,6 +38,8 @@ class Topic:
     """by field, (N,)"""
     notes: tuple[str, ...] = ()
     """what a reader must know of its stamps"""
+    as_received: bool = False
+    """whether its stamps are the times at which its messages were received and recorded"""
 
 
 Read = Callable[[Path, Mapping[str, set[str]]], dict[str, Topic]]
@@ -136,7 +138,8 @@ def _topic(table: NDArray[np.float64], fields: Sequence[str], by_header: bool) -
     notes = [] if by_header else [RECORDED]
     if not kept.all():
         notes.append(f"{(~kept).sum()} of its messages have no stamp: they are left out")
-    return Topic(table[kept, int(by_header)], dict(zip(fields, table[kept, 2:].T, strict=True)), tuple(notes))
+    values = dict(zip(fields, table[kept, 2:].T, strict=True))
+    return Topic(table[kept, int(by_header)], values, tuple(notes), as_received=not by_header)
 
 
 def _joints(message: Any) -> list[str]:

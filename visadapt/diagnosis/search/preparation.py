@@ -16,7 +16,7 @@ from visadapt.diagnosis.search.held_joints import without_held_joints
 from visadapt.diagnosis.search.motor_off import without_idle_ends
 from visadapt.diagnosis.search.pushed_rows import pushed_rows
 from visadapt.diagnosis.search.search import Search
-from visadapt.diagnosis.words import A_ROW_LATE, DERIVED, OPPOSITE
+from visadapt.diagnosis.words import A_ROW_LATE, DERIVED, OPPOSITE, PART_LATE, number, with_unit
 from visadapt.effects import Effect
 from visadapt.estimation.integration_step import with_longest_step
 from visadapt.estimation.likelihood import FitState
@@ -57,6 +57,11 @@ EVEN_LOG_ODDS = 5.0
 
 EARLIER_LOG_ODDS = 20.0
 """Log likelihood that commands a row earlier than recorded must gain: no machine answers before it is asked."""
+
+MIN_PART = 0.02  # Share of a row by which commands must be early to be moved
+
+MOST_BESIDE_LATE = 2
+"""Most effects that are fitted beside commands whose own stamps may be late: that the stamps are is common."""
 
 MOST_FILLED = 2
 """Rows in a row whose readings are filled in by cubics: the acceleration in more of them would be made up."""
@@ -311,26 +316,72 @@ def _in_signs_of_source(draft: _Draft, first: FitState, catalogue: Sequence[type
 
 
 def _with_commands_that_act(draft: _Draft, catalogue: Sequence[type[Effect]]) -> _Draft:
-    """With the commands one row earlier, where the recording has each beside the readings that it led to."""
-    system, readings = draft.readings.system, draft.readings
-    rows, raw = (replace(each, command=_a_row_earlier(each.command, 1)) for each in (draft.rows, draft.raw))
-    rows, raw = _with_unmeasured(rows, raw, system)
-    as_given, other = (
-        Search(system, one.select(draft.searched), catalogue, source)
-        for one, source in ((draft.rows, draft.source), (rows, None))
-    )
+    """With the commands earlier by a row, where the recording has each beside the readings that it led to, or by part
+    of a row, where their stamps are late."""
+    as_given, a_row = (_Earlier.of(draft, catalogue, share) for share in (0.0, 1.0))
+    by_rows = not draft.readings.recording.stamped_commands
     # Commands that are late by less than a row are, a row earlier, those of a machine with a delay.
-    if not sign_conventions.stays_ahead(other, as_given, EARLIER_LOG_ODDS, other.fit_delays):
-        return replace(draft, source=as_given.source.fits)
-    told = f"each command is recorded a row late, beside the readings that it led to: {A_ROW_LATE}"
-    moved = replace(readings, commands=[_a_row_earlier(each, 0) for each in readings.commands])
-    return replace(draft, readings=moved).changed(rows, raw, told)
+    if by_rows and sign_conventions.stays_ahead(
+        a_row.search, as_given.search, EARLIER_LOG_ODDS, a_row.search.fit_delays
+    ):
+        told = f"each command is recorded a row late, beside the readings that it led to: {A_ROW_LATE}"
+        return a_row.told(told)
+    share = 1 - a_row.delay_in_rows(beside=0 if by_rows else MOST_BESIDE_LATE)
+    if share > MIN_PART:
+        part = _Earlier.of(draft, catalogue, share)
+        if sign_conventions.stays_ahead(part.search, as_given.search, EARLIER_LOG_ODDS):
+            late = with_unit(number(share * draft.rows.period, 2), "s")
+            return part.told(f"the commands act {late} before their stamps, which are late: {PART_LATE}")
+    return replace(draft, source=as_given.search.source.fits)
 
 
-def _a_row_earlier(command: Tensor, dim: int) -> Tensor:
-    """Commands whose rows along a dimension are one earlier; the last stays."""
+@dataclass(frozen=True)
+class _Earlier:
+    """A draft whose commands are earlier by a share of a row."""
+
+    draft: _Draft
+    share: float
+    rows: Segments
+    raw: Segments
+    search: Search
+
+    @classmethod
+    def of(cls, draft: _Draft, catalogue: Sequence[type[Effect]], share: float) -> _Earlier:
+        """The draft with its commands earlier."""
+        system, rows, raw = draft.readings.system, draft.rows, draft.raw
+        if share:
+            rows, raw = (replace(one, command=_earlier(one.command, 1, share)) for one in (rows, raw))
+            rows, raw = _with_unmeasured(rows, raw, system)
+        source = None if share else draft.source
+        return cls(draft, share, rows, raw, Search(system, rows.select(draft.searched), catalogue, source))
+
+    def delay_in_rows(self, beside: int) -> float:
+        """The machine's delay that fits best, up to so many other effects `beside` it; a row, where no delay is among
+        the effects searched."""
+        sets = self.search.fit_delays(0.9)
+        if not sets:
+            return 1.0
+        best = max(sets, key=lambda one: one.log_odds)
+        delay, before = best.effects[0], None
+        while best is not before and len(best.effects) <= beside:
+            before = best
+            best = max(best, *self.search.extend([best], sign_conventions.LEADS), key=lambda one: one.log_odds)
+        return float(best.by_effect(best.fits.theta[0])[delay]) / self.rows.period
+
+    def told(self, warning: str) -> _Draft:
+        """The draft as it goes on."""
+        readings = self.draft.readings
+        commands = [_earlier(each, 0, self.share) for each in readings.commands]
+        moved = replace(self.draft, readings=replace(readings, commands=commands))
+        return moved.changed(self.rows, self.raw, warning)
+
+
+def _earlier(command: Tensor, dim: int, share: float) -> Tensor:
+    """Commands, held for a row each along a dimension, that come earlier by a share of a row: the means of their rows.
+    The last stays."""
     count = command.shape[dim]
-    return command.index_select(dim, torch.arange(1, count + 1).clamp(max=count - 1))
+    following = command.index_select(dim, torch.arange(1, count + 1).clamp(max=count - 1))
+    return torch.lerp(command, following, share)
 
 
 def means_until_next(command: Tensor, stamps: Tensor, rows: Tensor) -> Tensor:

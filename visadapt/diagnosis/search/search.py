@@ -188,10 +188,10 @@ class Search(FittedModels):
         bases = {each.names: each for each in (self.source, self.best, *alone[:LATE_BASES])}
         return self._fit_late([(base.effects, base.fits) for base in bases.values()])
 
-    def fit_delays(self) -> list[ScoredModel]:
-        """Each delay alone, which starts at half a period."""
+    def fit_delays(self, start: float = 0.5) -> list[ScoredModel]:
+        """Each delay alone, which starts at a share of a period."""
         delays = [effect for effect in self.catalogue if [p.name for p in effect.table] == ["delay"]]
-        return self.fit([((e,), with_effect(self.source.fits, [0.5 * self.rows.period])) for e in delays], QUICK)
+        return self.fit([((e,), with_effect(self.source.fits, [start * self.rows.period])) for e in delays], QUICK)
 
     def _grow_late(self, late: Sequence[ScoredModel]) -> None:
         """Add effects to a set with a late sensor that is the best of its size, while that raises the posterior odds.
