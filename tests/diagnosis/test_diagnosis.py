@@ -11,7 +11,7 @@ from tests.diagnosed import NOISE, record
 from visadapt import diagnose
 from visadapt.diagnosis.report.text import as_text
 from visadapt.diagnosis.search.preparation import prepare
-from visadapt.diagnosis.words import A_ROW_LATE
+from visadapt.diagnosis.words import A_ROW_LATE, PART_LATE
 from visadapt.effects import (
     ActuatorBacklash,
     ActuatorBias,
@@ -319,6 +319,18 @@ def test_commands_recorded_a_row_late_are_moved_up(effects):
     assert [warning for warning in prepared.warnings if A_ROW_LATE in warning]
     rows = len(late[0]) - 1  # the last command is not known
     assert torch.equal(prepared.rows.command[:, :rows], prepare(whole, CartPole()).rows.command[:, :rows])
+
+
+@pytest.mark.parametrize("effects", [(), (ViscousFriction(coefficient=2.0),)])
+def test_commands_whose_stamps_are_late_by_part_of_a_row_are_moved_by_it(effects):
+    # Commands a row late, and a delay of less than a row: each acts 0.02 s before the row that it is in.
+    whole = record([*effects, ActuatorDelay(delay=0.03)])
+    late = [np.concatenate((each.action[:1], each.action[:-1])) for each in whole.episodes]
+    episodes = [dataclasses.replace(each, action=action) for each, action in zip(whole.episodes, late, strict=True)]
+    recording = dataclasses.replace(whole, episodes=tuple(episodes), stamped_commands=True)
+    prepared = prepare(recording, CartPole(), [ActuatorDelay, ViscousFriction, ActuatorGain])
+    (said,) = [warning for warning in prepared.warnings if PART_LATE in warning]
+    assert float(said.split()[3]) == pytest.approx(0.02, abs=0.003)
 
 
 @pytest.fixture(scope="module")

@@ -73,7 +73,7 @@ def test_no_motion_tells_a_bias_of_the_motor_from_a_force(policy, pushed):
     found = ambiguous(("constant_force", "force", 1.0), ("actuator_bias", "offset", 1.0 / va.CartPole().max_force))
     planned = va.plan(found, pushed, SOURCE, policy, samples=60)
     assert not planned.settles
-    assert str(planned).startswith("no excitation within the ranges of the states tells constant_force from actuator")
+    assert str(planned).startswith("no excitation was found that tells constant_force from actuator")
 
 
 def test_the_file_is_what_is_added_over_time(tmp_path):

@@ -40,7 +40,7 @@ def test_readings_are_rows_and_commands_are_what_was_held_between_them(kind, tmp
 FIELDS = {"x": "/x.data", "theta": "/theta.data", "command": "/u.data"}
 
 
-def numbers(path, stamps):
+def numbers(path, stamps, command=lambda time: 0.5 if time > -0.1 else np.nan):
     """A bag of ROS 2 with a number at each of a topic's stamps, in s."""
     store = get_typestore(Stores.LATEST)
     number = store.types["std_msgs/msg/Float64"]
@@ -50,7 +50,7 @@ def numbers(path, stamps):
             for time in times:
                 # The angle passes the turn at 3 rad, as an encoder's does.
                 angle = (2 * time + 3 + np.pi) % (2 * np.pi) - np.pi
-                value = {"/x": time, "/theta": angle, "/u": 0.5 if time > -0.1 else np.nan}[topic]
+                value = {"/x": time, "/theta": angle, "/u": command(time)}[topic]
                 raw = store.serialize_cdr(number(value), "std_msgs/msg/Float64")
                 writer.write(connection, int(1e9 * (START + time)), raw)
     return path
@@ -97,6 +97,29 @@ def test_a_command_that_is_sent_when_it_changes_holds_to_the_end(sent, tmp_path)
     (episode,) = load_recording(numbers(tmp_path / "run", stamps), CartPole(), FIELDS).episodes
     assert len(episode.time) == len(steady)
     np.testing.assert_allclose(episode.action, 0.5)
+
+
+def of_commands(path, received):
+    """A recording of a bag whose command is received at these times, 0.05 s apart on average, and counts them."""
+    steady = np.arange(0, 3, 0.05)
+    stamps = {"/x": steady, "/theta": steady, "/u": received}
+    return load_recording(numbers(path, stamps, lambda time: np.floor((time + 0.01) / 0.05) / 100), CartPole(), FIELDS)
+
+
+def test_commands_of_a_steady_clock_act_when_it_sent_them(tmp_path):
+    sent = np.delete(np.arange(0, 3, 0.05) - 0.01, [20, 41])  # two were lost
+    late = np.random.default_rng(0).uniform(0.0005, 0.02, len(sent))
+    found, prompt = (of_commands(tmp_path / f"{k}", sent + each) for k, each in enumerate((late, late.min())))
+    assert [said for said in found.warnings if "/u: sent by a steady clock and received up to 0.0" in said]
+    assert not [said for said in prompt.warnings if "steady clock" in said]
+    rows = min(len(found.episodes[0].time), len(prompt.episodes[0].time))
+    np.testing.assert_allclose(found.episodes[0].action[-rows:], prompt.episodes[0].action[-rows:], atol=1e-3)
+
+
+def test_the_stamps_of_a_loop_that_sleeps_between_commands_are_kept(tmp_path):
+    steps = 0.05 + np.random.default_rng(0).uniform(0, 0.005, 54)
+    found = of_commands(tmp_path / "run", np.cumsum(steps) - 0.06)
+    assert not [said for said in found.warnings if "steady clock" in said]
 
 
 def test_rows_before_the_first_command_that_is_a_number_are_left_out(tmp_path):

@@ -178,6 +178,8 @@ def diagnose(
 
 def _check(recording: Recording, world: World, policy: policy_bound.StatesToActions | None) -> None:
     """Raises what `diagnose` does of a world, or a policy, that does not go with the recording."""
+    if not isinstance(recording, Recording):
+        raise TypeError(f"diagnose: {recording!r:.80} is no Recording; load_recording(FILE, system) reads one")
     if not isinstance(world, World):
         raise TypeError(f"diagnose: {type(world).__name__} is no World; World(system, period=...) is right")
     if len(world.effects):

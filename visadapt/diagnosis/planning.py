@@ -82,7 +82,7 @@ class Plan:
     def __str__(self) -> str:
         sets = [" and ".join(names) for names in self.explanations]
         if not self.settles:
-            return f"no excitation within the ranges of the states tells {sets[0]} from {' or '.join(sets[1:])}"
+            return f"no excitation was found that tells {sets[0]} from {' or '.join(sets[1:])}"
         white = "" if math.isnan(self.white) else f"; {self.white:.0f} for white noise"
         return (
             f"to tell {sets[0]} from {' or '.join(sets[1:])}: add {self.excitation} to the commands, for "

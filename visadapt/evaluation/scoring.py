@@ -105,7 +105,7 @@ def score(
         steps: of an episode; without it, those of the task, or 250.
 
     Raises:
-        TypeError: something else in the place of a policy.
+        TypeError: something else in the place of a policy or a target.
         ValueError: more steps than the task of a flight has, no episode or step, a policy that was trained for another
             period or is shown a goal on a target that is no `TaskTarget`, or a target whose system is neither a
             vehicle nor a cart-pole, or that shows no cart speed.
@@ -116,6 +116,10 @@ def score(
     (2, True)
     """
     check_policy(policy)
+    if not isinstance(target, Target):
+        raise TypeError(
+            f"score: {target!r:.80} is no target; SyntheticTarget() is one, and GymnasiumTarget(ID, map) of an environment"
+        )
     if episodes < 1 or (steps is not None and steps < 1):
         raise ValueError(f"{episodes} episodes of {steps} steps; at least one of each is right")
     check_period(policy, target)

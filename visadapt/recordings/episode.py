@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,6 +75,11 @@ class Episode:
         """Executed actions: what the ledger counts."""
         return len(self.time) - 1
 
+    def __repr__(self) -> str:
+        """With the shapes of its arrays, of which a recording has thousands of numbers."""
+        arrays = {each.name: getattr(self, each.name) for each in fields(self)}
+        return f"Episode({', '.join(f'{name} {values.shape}' for name, values in arrays.items() if values is not None)})"
+
     def part(self, rows: slice) -> Episode:
         """Some of its rows; times still count from its start."""
         arrays = {each.name: getattr(self, each.name) for each in fields(self)}
@@ -104,7 +109,7 @@ class Recording:
     """where each episode comes from, for messages: "run3.csv, episode 2" """
     warnings: tuple[str, ...] = ()
     """what was changed or left out, a line each"""
-    usable: tuple[NDArray[np.bool_], ...] = ()
+    usable: tuple[NDArray[np.bool_], ...] = field(default=(), repr=False)
     """(T, n_measured) for each episode, which readings are measurements; without it, all are"""
     resolution: tuple[float, ...] = ()
     """smallest meaningful difference of each measured state; without it, the smallest between two of its readings"""

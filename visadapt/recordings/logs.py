@@ -37,8 +37,8 @@ LEAST_STEADY = 20
 STEADY = "the clock's times are used"
 """What a note says of messages that came late, each by a time of its own."""
 
-WORTH_SAYING_S = 1e-4
-"""Delays of messages above which these are worth a note."""
+STEADY_WITHIN_S = 1e-4
+"""Difference between the delays of messages up to which their stamps are left as they are."""
 
 GAP = 5.0
 """Longest interval between a topic's readings, in median intervals, that is interpolated; longer ones have no rows."""
@@ -152,7 +152,7 @@ class _Log:
         for name, topic in self.topics.items():
             if topic.as_received:
                 topics[name], late = _as_sent(topic)
-                if late > WORTH_SAYING_S:
+                if late:
                     note(f"{name}: sent by a steady clock and received up to {late:.2g} s late: {STEADY}", str(self.path))
         return replace(self, topics=topics)
 
@@ -238,7 +238,7 @@ def _as_sent(topic: Topic) -> tuple[Topic, float]:
     slope, first = np.polyfit(number, topic.time - topic.time[0], 1)
     late = topic.time - topic.time[0] - (slope * number + first)
     sleeps = np.var(late) > np.var(steps - slope * periods)
-    if sleeps or np.ptp(late) >= period:
+    if sleeps or not STEADY_WITHIN_S < np.ptp(late) < period:
         return topic, 0.0
     return replace(topic, time=topic.time - (late - late.min())), float(np.ptp(late))
 

@@ -81,21 +81,23 @@ def _is_derived(pairs: Sequence[tuple[Floats, Floats]], fresh: Sequence[NDArray[
 
 def with_empty_cells(raw: RawEpisode, system: System, note: Note) -> RawEpisode:
     """The episode of a table in which the cells of a sensor slower than the rows are empty, or those of commands that
-    come less often: these are held until the next.
+    come less often: these are held until the next. Rows before the first command are left out.
 
     A column in which hardly a cell is empty stays as it is.
     """
+    first = int((~np.isnan(raw.action)).argmax(0).max())
+    if first:
+        note(f"the {first} rows before the first command are left out", raw.origin)
+        raw = raw.part(first, len(raw.time))
     empty = np.isnan(raw.action)
     sparse = empty.sum(0) >= FEWEST_EMPTY
     if sparse.any():
-        first = int((~empty[:, sparse]).argmax(0).max())
-        raw, empty = raw.part(first, len(raw.time)), empty[first:]
         action = raw.action.copy()
         for column in np.flatnonzero(sparse):
             rows = np.where(empty[:, column], 0, np.arange(len(action)))
             action[:, column] = action[np.maximum.accumulate(rows), column]
             told = f"{system.actions[column].name} is empty in {int(empty[:, column].sum())} of {len(empty)} rows: held"
-            note(told + (f"; the {first} rows before the first command are left out" if first else ""), raw.origin)
+            note(told, raw.origin)
         raw = replace(raw, action=action)
     missing = np.isnan(raw.state)
     sparse = (missing.sum(0) >= FEWEST_EMPTY) & ~missing.all(0)

@@ -22,9 +22,9 @@ EDGE_SHARE = 0.05  # Share of a push's peak at which it starts and ends
 
 SHAPE_POINTS = 500  # Instants at which the shape of a push is evaluated
 
-MAX_APART = 2.0  # Distance of two bumps on a joint, over the sum of their widths, up to which they overlap
+MODEL_ERROR = 0.1  # Deviation of an impulse, as a share of it, since the masses that it moves are not known exactly
 
-SHAPE_ERROR = 0.15  # Deviation of an impulse, as a share of it, because a push need not have the shape of a bump
+MAX_APART = 2.0  # Distance of two bumps on a joint, over the sum of their widths, up to which they overlap
 
 
 @dataclass(frozen=True)
@@ -75,12 +75,18 @@ def overlapping(bumps: Sequence[Bump]) -> list[list[Bump]]:
 
 
 def summed(
-    bumps: Sequence[Bump], deviation: float, tracks: Sequence[LoadTrack], loads: Sequence[Variable], tries: int
+    bumps: Sequence[Bump],
+    impulse: float,
+    deviation: float,
+    tracks: Sequence[LoadTrack],
+    loads: Sequence[Variable],
+    tries: int,
 ) -> Push:
-    """The push whose shape is the sum of overlapping bumps.
+    """The push whose shape is the sum of overlapping bumps, raised to its impulse where all are of one sign.
 
     Args:
-        deviation: of the bumps' impulse, over the root mean square of the joint's load.
+        impulse: over the root mean square of the joint's load, s.
+        deviation: of the impulse.
         tries: how many bumps were tried on the tracks.
     """
     track, load = tracks[bumps[0].part], loads[bumps[0].joint]
@@ -89,11 +95,11 @@ def summed(
     time = np.linspace(min(a for a, _ in extents), max(b for _, b in extents), SHAPE_POINTS)
     heights, middles, widths = np.array([(one.height, one.middle, one.width) for one in bumps]).T
     shape = unit * np.exp(-0.5 * ((time[:, None] - middles) / widths) ** 2) @ heights
-    peak = shape[np.abs(shape).argmax()]
-    during = time[shape / peak >= EDGE_SHARE]
-    impulse = unit * sum(one.height * one.area for one in bumps)
-    spread = Z_90 * math.hypot(unit * deviation, SHAPE_ERROR * impulse)
+    during = time[shape / shape[np.abs(shape).argmax()] >= EDGE_SHARE]
+    raised = impulse / sum(one.height * one.area for one in bumps)
+    peak = float(shape[np.abs(shape).argmax()]) * (raised if raised > 0 and np.ptp(np.sign(heights)) == 0 else 1.0)
+    impulse, spread = unit * impulse, Z_90 * unit * math.hypot(deviation, MODEL_ERROR * impulse)
     p_value = min(1.0, tries * math.erfc(max(one.score for one in bumps) / math.sqrt(2)))
     start, end = max(0.0, float(during[0])), float(during[-1])
     ci90 = impulse - spread, impulse + spread
-    return Push(track.episode, load.name, start, end, float(peak), load.unit, impulse, ci90, p_value)
+    return Push(track.episode, load.name, start, end, peak, load.unit, impulse, ci90, p_value)

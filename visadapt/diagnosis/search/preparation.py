@@ -365,7 +365,8 @@ class _Earlier:
         delay, before = best.effects[0], None
         while best is not before and len(best.effects) <= beside:
             before = best
-            best = max(best, *self.search.extend([best], sign_conventions.LEADS), key=lambda one: one.log_odds)
+            grown = self.search.extend([best], sign_conventions.LEADS)
+            best = max((best, *grown), key=lambda one: one.log_odds)
         return float(best.by_effect(best.fits.theta[0])[delay]) / self.rows.period
 
     def told(self, warning: str) -> _Draft:

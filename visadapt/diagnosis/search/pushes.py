@@ -13,6 +13,7 @@ that holds a cart for half a second pass for a push.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -21,7 +22,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool1d, pad
 
 from visadapt.diagnosis.result import Push
-from visadapt.diagnosis.search.bumps import Bump, bumps_at, overlapping, summed
+from visadapt.diagnosis.search.bumps import EDGE, Bump, bumps_at, overlapping, summed
 from visadapt.diagnosis.search.unexplained import CLEAR_LOG_ODDS, SmoothFunction
 from visadapt.diagnosis.search.unexplained_load import LoadTrack, load_tracks
 from visadapt.recordings import Recording
@@ -70,6 +71,9 @@ MIN_WEIGHT = 1e-3  # of an instant at rest where the size of a moving joint's er
 
 MIN_DISTINCT = 0.15  # Least share of a bump's information that columns and other bumps leave to it
 
+ANY_SHAPE_PRIOR = 5.0
+"""Prior standard deviation of a push's load at an instant, over its peak, where its impulse is measured."""
+
 BUMP_PRIOR = 7.0  # Prior standard deviation of a bump's height, over that of the unexplained load
 
 
@@ -93,7 +97,7 @@ def pushes(
         return ()  # errors too small, or too large, for any push to stand out
     middles = sum(float(track.time[-1] - track.time[0]) / (SPACING * width) for track in tracks for width in widths)
     tries = round(middles) * tracks[0].load.shape[1]
-    named = [summed(bumps, deviation, tracks, worlds[0].system.loads, tries) for bumps, deviation in found]
+    named = [summed(bumps, *impulse, tracks, worlds[0].system.loads, tries) for bumps, impulse in found]
     sure = [push for push in named if push.p_value <= MAX_P_VALUE and push.ci90[0] * push.ci90[1] > 0]
     return tuple(sorted(sure, key=lambda push: (push.episode, push.start)))
 
@@ -140,8 +144,8 @@ class _Fit:
         self.innovation = torch.ones(joints, dtype=torch.float64)
         self.first = torch.eye(LAGS, dtype=torch.float64).repeat(joints, 1, 1)
 
-    def pushes(self) -> list[tuple[list[Bump], float]]:
-        """The bumps that stand out clearly, those that overlap together, with the deviation of their impulse."""
+    def pushes(self) -> list[tuple[list[Bump], tuple[float, float]]]:
+        """The bumps that stand out clearly, those that overlap together, with their impulse and its deviation."""
         self._fit(ROUNDS)
         searched: Sequence[int] = range(len(self.tracks))
         for k in range(MAX_BUMPS):
@@ -162,7 +166,7 @@ class _Fit:
                 break
             self.bumps = [one for one in self.bumps if one not in weakest.values()]
             self._fit(ROUNDS_AGAIN)
-        return [(group, self._impulse_deviation(group)) for group in overlapping(self.bumps)]
+        return [(group, self._impulse(group)) for group in overlapping(self.bumps)]
 
     def _refine(self) -> None:
         """Choose middle and width of each bump that overlaps no other again: the errors are better known by now.
@@ -317,14 +321,29 @@ class _Fit:
         tried = (best(joint, middles(width), width) for width in self.widths for joint in on)
         return max(tried, key=lambda one: one.score)
 
-    def _impulse_deviation(self, group: Sequence[Bump]) -> float:
-        """Standard deviation of the impulse of some bumps on a part."""
-        part = group[0].part
-        bumps = [one for one in self.bumps if one.part == part]
-        areas = torch.tensor([BUMP_PRIOR * one.area if one in group else 0.0 for one in bumps], dtype=torch.float64)
-        root = self.roots[part]
-        along = pad(areas, (len(root) - len(bumps), 0))[:, None]
-        return float(torch.linalg.solve_triangular(root, along, upper=False).square().sum().sqrt())
+    def _impulse(self, group: Sequence[Bump]) -> tuple[float, float]:
+        """The impulse of some overlapping bumps on a part, over the load's root mean square, and its standard
+        deviation: of a load of any shape in their place, so that what moves with a push, as the states that it throws
+        far out do, takes none of it."""
+        part, joint = group[0].part, group[0].joint
+        track, others = self.tracks[part], [one for one in self.bumps if one not in group]
+        during = torch.zeros(len(track.time), dtype=torch.bool)
+        for one in group:
+            during |= (track.time - one.middle).abs() <= EDGE * one.width
+        step = float(track.time.diff().mean())
+        prior = ANY_SHAPE_PRIOR * max(abs(one.height) for one in group)
+        free = torch.zeros(int(during.sum()), *track.load.shape, dtype=torch.float64)
+        free[..., joint] = prior * bumps_at(track, track.time[during], step / math.sqrt(2 * math.pi))
+        columns = self._design(part)
+        columns = columns[: len(columns) - sum(one.part == part for one in self.bumps)]
+        kept = [BUMP_PRIOR * one.on(track) for one in others if one.part == part]
+        design = self._whitened(part, torch.cat((columns, free, *(one[None] for one in kept))))
+        weighted = design * (OUTLIER / self._whitened(part, self.residual[part]).abs().clamp(min=1e-9)).clamp(max=1)
+        root = torch.linalg.cholesky(weighted @ design.T + torch.eye(len(design), dtype=torch.float64))
+        weights = torch.cholesky_solve((weighted @ self._whitened(part, track.load))[:, None], root)[:, 0]
+        areas = pad(torch.full((len(free),), prior * step, dtype=torch.float64), (len(columns), len(kept)))
+        deviation = torch.linalg.solve_triangular(root, areas[:, None], upper=False).square().sum().sqrt()
+        return float(areas @ weights), float(deviation)
 
     def _measured(self) -> list[Bump]:
         """The bumps with their heights as fitted together."""
