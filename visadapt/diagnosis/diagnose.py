@@ -14,7 +14,7 @@ from visadapt.diagnosis.answer import Answer, answer
 from visadapt.diagnosis.exploration import Explored
 from visadapt.diagnosis.figures_data import disturbances, figure_data, film_frames
 from visadapt.diagnosis.frames import UNSEEN, Film, FramesError, watch, with_camera
-from visadapt.diagnosis.next_experiment import OF_ONE_MACHINE
+from visadapt.diagnosis.next_experiment import AS_IT_CHANGES, OF_ONE_MACHINE
 from visadapt.diagnosis.result import (
     NO_GAP,
     UNEXPLAINED,
@@ -37,6 +37,7 @@ from visadapt.diagnosis.search.unexplained_load import unread_states
 from visadapt.diagnosis.verdict import (
     at_bounds,
     hovers,
+    in_turn,
     late_by_less_than,
     left_unexplained,
     next_step,
@@ -146,6 +147,8 @@ def diagnose(
         gap=gap,
         next_experiment=OF_ONE_MACHINE
         if verdict == UNEXPLAINED and explored.apart
+        else AS_IT_CHANGES
+        if verdict == UNEXPLAINED and explored.changes
         else next_step(
             search,
             comparison,
@@ -230,6 +233,8 @@ def _warnings(answered: Answer, origin: str) -> Iterator[str]:
         yield f"{origin}: {TOO_SHORT}"
     if verdict == UNEXPLAINED and explored.apart:
         yield one_by_one(explored.apart)
+    if verdict == UNEXPLAINED and explored.changes:
+        yield in_turn(explored.changes)
     unexplained = comparison.unexplained(measured.improvable)
     yield from left_unexplained(comparison, verdict, unexplained)
     yield from at_bounds(comparison, found, explored.effects)

@@ -10,6 +10,7 @@ from visadapt.diagnosis.search import duration
 from visadapt.diagnosis.search.all_rows import best_on_all_rows, on_all_rows
 from visadapt.diagnosis.search.apart import ExplainedAlone, explained_apart
 from visadapt.diagnosis.search.causes import Alternative, alternatives
+from visadapt.diagnosis.search.changing import Changing, changing
 from visadapt.diagnosis.search.coloured import colour_left_by, with_coloured_noise
 from visadapt.diagnosis.search.fitted_models import MIN_LEFTOVER
 from visadapt.diagnosis.search.jumps import with_jumps
@@ -35,6 +36,7 @@ class Explored:
     groups: list[list[Alternative]]  # the effects of the best set, each with those that fit as well in its place
     repeats: list[tuple[Cause, float]]  # causes of repeated readings, and the log likelihood lost without them
     apart: tuple[ExplainedAlone, ...]  # recordings that are explained one by one, and not together
+    changes: tuple[Changing, ...]  # what explains everything if it changes within the recording, the likeliest first
 
 
 def explore(
@@ -72,12 +74,15 @@ def explore(
     comparison = compare(search)
     repeats = repeated_reading_causes(prepared, search, comparison, repeating)
     apart: tuple[ExplainedAlone, ...] = ()
+    changes: tuple[Changing, ...] = ()
     if comparison.leftover > MIN_LEFTOVER and not comparison.negligible and jumping is None:
         apart = explained_apart(searched_in, candidates, recording.sources, progress)
-    if not apart:
+        changes = () if apart else changing(searched_in)
+    if not apart and not changes:
         again = staged(progress, "search with coloured noise")
         search, comparison = with_coloured_noise(search, comparison, prepared.searched, again)
     # Periodic effects may have got a phase for each episode.
     in_use = {effect.name: effect for effect in search.catalogue}
     named = [in_use.get(effect.name, effect) for effect in effects]
-    return Explored(named, prepared, search, comparison, alternatives(comparison, named, system), repeats, apart)
+    groups = alternatives(comparison, named, system)
+    return Explored(named, prepared, search, comparison, groups, repeats, apart, changes)

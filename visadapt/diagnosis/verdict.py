@@ -9,13 +9,14 @@ from visadapt.diagnosis import next_experiment
 from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, NO_GAP, UNEXPLAINED, Cause, Gap, without_slight
 from visadapt.diagnosis.search.apart import ExplainedAlone
 from visadapt.diagnosis.search.causes import Alternative, is_at_end
+from visadapt.diagnosis.search.changing import Changing
 from visadapt.diagnosis.search.fitted_models import ScoredModel
 from visadapt.diagnosis.search.heldout import MIN_GAP
 from visadapt.diagnosis.search.model_comparison import ModelComparison
 from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.search.sensor_checks import CoarseSteps
 from visadapt.diagnosis.search.unexplained import SmoothFunction, smooth_functions
-from visadapt.diagnosis.words import ONE_BY_ONE, listed, number, plain, with_unit
+from visadapt.diagnosis.words import CHANGES, ONE_BY_ONE, listed, number, plain, with_unit
 from visadapt.effects import EFFECTS, Effect, Parameter, QuadraticDrag, RotorDrag
 from visadapt.effects.aerial import AirDrag
 from visadapt.estimation.candidate import CandidateModel
@@ -118,6 +119,25 @@ def one_by_one(apart: Sequence[ExplainedAlone]) -> str:
     """The warning of recordings that are explained one by one, and not together."""
     each = (f"{one.source} by {_with_values(one.best) or 'the unchanged simulator'}" for one in apart)
     return f"{ONE_BY_ONE}: {'; '.join(each)}"
+
+
+def in_turn(changes: Sequence[Changing]) -> str:
+    """The warning of a recording that is explained by effects whose sizes change within it."""
+    sets = []
+    for one in changes:
+        parts = [
+            f"{plain(effect.name)} ({', '.join(_in_turn(one, effect, k) for k in range(len(effect.table)))})"
+            for effect in one.fits[0].effects
+        ]
+        sets.append(listed(parts))
+    count = len(changes[0].fits)
+    return f"{CHANGES}: {count} stretches of it, one after the other, are explained by {listed(sets, 'or')}"
+
+
+def _in_turn(change: Changing, effect: type[Effect], index: int) -> str:
+    """A parameter of an effect with its value in each stretch."""
+    values = ", ".join(number(float(fit.by_effect(fit.fits.theta[0])[effect][index])) for fit in change.fits)
+    return f"{effect.table[index].name} {with_unit(values, effect.table[index].unit)}"
 
 
 def _with_values(found: ScoredModel) -> str:

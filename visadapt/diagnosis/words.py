@@ -18,6 +18,9 @@ BESIDE_PUSHES = (
 ONE_BY_ONE = "each recording is explained by itself, but not all together"
 """What the warning begins with of recordings between which the machine was changed."""
 
+CHANGES = "what acts changes within the recording"
+"""What the warning begins with of a recording in which the size of an effect changes."""
+
 A_ROW_LATE = "the commands were moved a row up"
 """What it warns of where each command was recorded a row late."""
 PART_LATE = "the commands were moved by that"

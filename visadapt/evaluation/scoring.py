@@ -118,7 +118,7 @@ def score(
     check_policy(policy)
     if not isinstance(target, Target):
         raise TypeError(
-            f"score: {target!r:.80} is no target; SyntheticTarget() is one, and GymnasiumTarget(ID, map) of an environment"
+            f"score: {target!r:.80} is no target; SyntheticTarget() is one, GymnasiumTarget(ID, map) another"
         )
     if episodes < 1 or (steps is not None and steps < 1):
         raise ValueError(f"{episodes} episodes of {steps} steps; at least one of each is right")

@@ -78,7 +78,9 @@ class Episode:
     def __repr__(self) -> str:
         """With the shapes of its arrays, of which a recording has thousands of numbers."""
         arrays = {each.name: getattr(self, each.name) for each in fields(self)}
-        return f"Episode({', '.join(f'{name} {values.shape}' for name, values in arrays.items() if values is not None)})"
+        return (
+            f"Episode({', '.join(f'{name} {values.shape}' for name, values in arrays.items() if values is not None)})"
+        )
 
     def part(self, rows: slice) -> Episode:
         """Some of its rows; times still count from its start."""

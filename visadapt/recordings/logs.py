@@ -153,7 +153,9 @@ class _Log:
             if topic.as_received:
                 topics[name], late = _as_sent(topic)
                 if late:
-                    note(f"{name}: sent by a steady clock and received up to {late:.2g} s late: {STEADY}", str(self.path))
+                    note(
+                        f"{name}: sent by a steady clock and received up to {late:.2g} s late: {STEADY}", str(self.path)
+                    )
         return replace(self, topics=topics)
 
     def rows(self, note: Note) -> NDArray[np.intp]:

@@ -24,6 +24,7 @@ from visadapt.diagnosis.result import (
 )
 from visadapt.diagnosis.words import (
     BESIDE_PUSHES,
+    CHANGES,
     MISFIT,
     ONE_BY_ONE,
     chance,
@@ -171,6 +172,11 @@ def _unexplained(diagnosis: Diagnosis) -> str:
         )
     if any(warning.startswith(ONE_BY_ONE) for warning in diagnosis.warnings):
         return f"{_capitalised(ONE_BY_ONE)}: the machine, or a sensor, was changed between them (see the warning)."
+    if any(warning.startswith(CHANGES) for warning in diagnosis.warnings):
+        return (
+            f"{_capitalised(CHANGES)}, as where a battery runs down, a bearing warms up or a load is dropped (see the "
+            "warning)."
+        )
     if math.isnan(gap.closed):
         return (
             "The simulator predicts as well as the fitted noise allows, but a gap hides, or may hide, in that noise: "

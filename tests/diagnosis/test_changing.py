@@ -1,0 +1,65 @@
+"""Recordings within which an effect changes: it is said what, and how large it is from stretch to stretch."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from tests.diagnosed import record
+from visadapt.diagnosis import diagnose
+from visadapt.diagnosis.next_experiment import AS_IT_CHANGES
+from visadapt.diagnosis.words import CHANGES
+from visadapt.effects import ActuatorGain, CoulombFriction, PoleLength, ViscousFriction
+from visadapt.effects.forces import CartForce
+from visadapt.recordings import Recording
+from visadapt.systems import CartPole
+from visadapt.world import World
+
+CATALOGUE = [ViscousFriction, CoulombFriction, ActuatorGain, PoleLength]
+
+
+def one_after_the_other(sets) -> Recording:
+    """Episodes of one file, each with effects of its own."""
+    parts = [record(effects, 1, seed=k) for k, effects in enumerate(sets)]
+    episodes = tuple(part.episodes[0] for part in parts)
+    return dataclasses.replace(parts[0], episodes=episodes, sources=tuple(f"run.csv, episode {k}" for k in range(6)))
+
+
+def sizes(warnings, effect):
+    (said,) = (warning for warning in warnings if warning.startswith(CHANGES))
+    numbers = said.partition(f"{effect} (")[2].partition(")")[0].split(" ", 1)[1]
+    return [float(number.split()[0]) for number in numbers.split(", ")]
+
+
+@pytest.mark.parametrize(
+    ("effect", "parameter", "values"),
+    [
+        (ActuatorGain, "scale", np.linspace(1, 0.7, 6)),
+        (ViscousFriction, "coefficient", 1 + 4 * np.exp(-np.arange(6) / 2)),
+        (PoleLength, "scale", [1, 1, 1, 1.25, 1.25, 1.25]),
+    ],
+)
+def test_its_size_is_said_from_stretch_to_stretch(effect, parameter, values):
+    found = diagnose(
+        one_after_the_other([[effect(**{parameter: float(each)})] for each in values]), World(CartPole()), CATALOGUE
+    )
+    assert (found.verdict, found.next_experiment) == ("unexplained", AS_IT_CHANGES)
+    np.testing.assert_allclose(sizes(found.warnings, effect.name.replace("_", " ")), values, rtol=0.1)
+    assert str(found).startswith("unexplained: What acts changes within the recording")
+
+
+class Ridges(CartForce):
+    """A force that no effect of the catalogue describes, and that is always the same."""
+
+    name = "ridges"
+    equation = "F = 2 sin(60 x)"
+    table = ()
+
+    def push(self, time, state, system):
+        return 2 * (60 * state[:, 0]).sin()
+
+
+@pytest.mark.parametrize("effects", [(), [ViscousFriction(coefficient=2.0)], [Ridges()]])
+def test_of_what_stays_the_same_nothing_is_said(effects):
+    found = diagnose(one_after_the_other([effects] * 6), World(CartPole()), CATALOGUE)
+    assert not any(warning.startswith(CHANGES) for warning in found.warnings)
