@@ -16,7 +16,8 @@ from visadapt.effects import Role
 from visadapt.estimation.fit_states import CAREFUL, with_effect
 
 MOST_PARTS, FEWEST_PARTS = 6, 3
-"""Stretches of a recording to which the same effects are fitted with sizes of their own; a window holds no two."""
+"""Stretches of a recording to which the same effects are fitted, each with sizes of its own: as many as there are
+windows, within these limits."""
 
 MOST_TRIED = (4, 2)
 """Sets of one effect and of two that are tried, the most probable first: of two where no single one explains all."""
