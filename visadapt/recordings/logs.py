@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from visadapt.recordings.clock import Note, RawEpisode
 from visadapt.recordings.columns import Column, check_given, if_unmeasured, needed, read_column
+from visadapt.recordings.command_clock import means_until_next
 from visadapt.recordings.episode import RecordingError
 from visadapt.recordings.topics import Read, Topic
 from visadapt.systems import RigidBody, System
@@ -197,7 +198,7 @@ class _Log:
 
     def command(self, name: str, time: NDArray[np.float64]) -> NDArray[np.float64]:
         """The command of an action in rows with these stamps (T,)."""
-        return _held(time, self.topics[self.columns[name][0]].time, self.values(name))
+        return means_until_next(time, self.topics[self.columns[name][0]].time, self.values(name))
 
     def values(self, name: str) -> NDArray[np.float64]:
         """A measured state, or an action, in our units in every message (N,) of its topic."""
@@ -266,20 +267,6 @@ def _between_readings(time: NDArray[np.float64], stamps: NDArray[np.float64]) ->
     after = np.searchsorted(stamps, time).clip(1, len(stamps) - 1)
     intervals = np.diff(stamps)
     return intervals[after - 1] <= GAP * np.median(intervals)
-
-
-def _held(time: NDArray[np.float64], stamps: NDArray[np.float64], commands: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The mean of the held commands (N,) from each time (T,) to the next, NaN where one of them is; for the last time,
-    the command held there."""
-
-    def mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        total = np.concatenate(([0.0], np.cumsum(values[:-1] * np.diff(stamps))))
-        after = np.maximum(time - stamps[-1], 0.0) * values[-1]  # a command goes on after the last message
-        held: NDArray[np.float64] = np.diff(np.interp(time, stamps, total) + after) / np.maximum(np.diff(time), 1e-12)
-        return np.append(held, values[np.searchsorted(stamps, time[-1], side="right") - 1])
-
-    missing = mean(np.isnan(commands).astype(float))
-    return np.where(missing > 1e-9, np.nan, mean(np.nan_to_num(commands)))
 
 
 def _topic_and_field(path: Path, column: str) -> tuple[str, str]:
