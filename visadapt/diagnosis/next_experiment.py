@@ -125,7 +125,7 @@ def untouched(pushed: Collection[str]) -> str:
     """The experiment that shows whether what pushes these loads is a hand."""
     return (
         f"Pushes on {listed([plain(load) for load in sorted(pushed)])} were found: record runs in which nothing "
-        "touches the machine, no gust either, to see whether they return."
+        "touches the machine, neither a hand nor a gust nor an end stop, to see whether they return."
     )
 
 
