@@ -107,7 +107,7 @@ def test_commands_hold_until_the_next(file, run):
     recording = load(write(file, {**run, "command": with_empty(run["command"], ~given)}))
     (episode,) = recording.episodes
     np.testing.assert_allclose(episode.action[:, 0], held(run["command"], given)[3:])
-    assert any("3 rows before the first command are left out" in said for said in recording.warnings)
+    assert any("rows before the first command are left out: 3" in said for said in recording.warnings)
 
 
 def test_an_outlier_of_a_slow_sensor_is_set_aside(file, run):

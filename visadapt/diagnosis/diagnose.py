@@ -233,7 +233,7 @@ def _warnings(answered: Answer, origin: str) -> Iterator[str]:
         yield f"{origin}: {TOO_SHORT}"
     if verdict == UNEXPLAINED and explored.apart:
         yield one_by_one(explored.apart)
-    if verdict == UNEXPLAINED and explored.changes:
+    if explored.changes:
         yield in_turn(explored.changes)
     unexplained = comparison.unexplained(measured.improvable)
     yield from left_unexplained(comparison, verdict, unexplained)

@@ -44,9 +44,9 @@ OF_ONE_MACHINE = (
 """For recordings that are explained one by one, and not together."""
 
 AS_IT_CHANGES = (
-    "What acts changes within the recording: make two recordings in which it does not, one as this one begins and one "
-    "as it ends (a full and an empty battery, a cold and a warm bearing, with and without the load), and diagnose each "
-    "by itself."
+    "The size of an effect changes within the recording: make two recordings in which it does not, one as this one "
+    "begins and one as it ends (a full and an empty battery, a cold and a warm bearing, with and without the load), "
+    "and diagnose each by itself."
 )
 """For a recording that is explained by effects whose sizes change within it."""
 

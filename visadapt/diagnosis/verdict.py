@@ -125,19 +125,19 @@ def in_turn(changes: Sequence[Changing]) -> str:
     """The warning of a recording that is explained by effects whose sizes change within it."""
     sets = []
     for one in changes:
-        parts = [
-            f"{plain(effect.name)} ({', '.join(_in_turn(one, effect, k) for k in range(len(effect.table)))})"
-            for effect in one.fits[0].effects
-        ]
+        turns = iter(zip(*one.values, strict=True))  # of each parameter, from stretch to stretch
+        parts = []
+        for effect in one.effects:
+            values = [_in_turn(parameter, next(turns)) for parameter in effect.table]
+            parts.append(f"{plain(effect.name)} ({', '.join(values)})")
         sets.append(listed(parts))
-    count = len(changes[0].fits)
+    count = len(changes[0].values)
     return f"{CHANGES}: {count} stretches of it, one after the other, are explained by {listed(sets, 'or')}"
 
 
-def _in_turn(change: Changing, effect: type[Effect], index: int) -> str:
-    """A parameter of an effect with its value in each stretch."""
-    values = ", ".join(number(float(fit.by_effect(fit.fits.theta[0])[effect][index])) for fit in change.fits)
-    return f"{effect.table[index].name} {with_unit(values, effect.table[index].unit)}"
+def _in_turn(parameter: Parameter, values: Sequence[float]) -> str:
+    """A parameter with its value in each stretch."""
+    return f"{parameter.name} {with_unit(', '.join(map(number, values)), parameter.unit)}"
 
 
 def _with_values(found: ScoredModel) -> str:

@@ -18,13 +18,15 @@ BESIDE_PUSHES = (
 ONE_BY_ONE = "each recording is explained by itself, but not all together"
 """What the warning begins with of recordings between which the machine was changed."""
 
-CHANGES = "what acts changes within the recording"
+CHANGES = "the size of an effect changes within the recording"
 """What the warning begins with of a recording in which the size of an effect changes."""
 
 A_ROW_LATE = "the commands were moved a row up"
 """What it warns of where each command was recorded a row late."""
-PART_LATE = "the commands were moved by that"
-"""What it warns of where the commands' stamps are late by part of a row."""
+PART_LATE = "they were moved earlier by as much"
+"""What it warns of where the commands are late by part of a row."""
+OWN_CLOCK = "by a clock that is not that of the rows: a command is the mean of what was sent until the next row"
+"""What it warns of where the controller sends at other times than the rows'."""
 
 OPPOSITE = " has the opposite sign of the source's"
 """What a diagnosis warns of, after the quantity's name, where it inverted a sign of the recording."""

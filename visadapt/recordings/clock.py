@@ -78,7 +78,7 @@ class RawEpisode:
     usable: NDArray[np.bool_] | None = None
     """(T, n_measured) which readings are measurements; without it, all are"""
     stamped_commands: bool = False
-    """whether its commands had stamps of their own, by which they came into these rows"""
+    """whether its commands had stamps of their own; a row holds the mean until the next one"""
 
     @property
     def origin(self) -> str:
@@ -126,11 +126,17 @@ class RawEpisode:
 
     def part(self, start: int, end: int) -> RawEpisode:
         """The rows from `start` up to, but not including, `end`."""
-        rows = slice(start, end)
+        return self._rows(slice(start, end), lambda row: self.place(start + row))
+
+    def without(self, left_out: NDArray[np.bool_]) -> RawEpisode:
+        """The rows that are not `left_out` (T,)."""
+        kept = np.flatnonzero(~left_out)
+        return self._rows(kept, lambda row: self.place(int(kept[row])))
+
+    def _rows(self, rows: slice | NDArray[np.intp], place: Callable[[int], str]) -> RawEpisode:
         time, action, state = self.time[rows], self.action[rows], self.state[rows]
         frame = None if self.frame is None else self.frame[rows]
         usable = None if self.usable is None else self.usable[rows]
-        place = lambda row: self.place(start + row)  # noqa: E731
         return replace(self, time=time, action=action, state=state, frame=frame, usable=usable, place=place)
 
 

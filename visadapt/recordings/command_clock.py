@@ -1,65 +1,64 @@
-"""Commands of a controller with a clock of its own, slower than the rows: a row holds the last one that was sent."""
+"""The times at which a controller sent the commands of a recording."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from math import gcd
 
 import numpy as np
 from numpy.typing import NDArray
 
-from visadapt.recordings.clock import Note, RawEpisode
-
 FEWEST_CHANGES = 50  # of the command, to tell the controller's clock
 
 MOST_PAIRED = 1000  # Changes, spread evenly, whose pairs bound the controller's period
 
-SLACK = 0.02
-"""Rows by which a command may come outside of the row in which it first shows: stamps are rounded."""
+SLACK = 0.02, 0.5e-3
+"""Rows, and s at most, by which a command may have been sent outside of the row before the one that shows it: stamps
+may be rounded to ms."""
 
-SLOWER = 1.05  # Rows that a controller's period must have, and its distance from whole rows, below which it has none
+SLOWER = 1.05
+"""Least period of the controller, in rows, and least ratio of its period to whole rows: else commands are taken to be
+given in the loop of the rows."""
 
-Floats = NDArray[np.float64]
+FEWEST_STEADY = 20
+LATE, MOST_LATE = 1.5, 0.05
+"""A controller sends steadily, where of so many intervals between commands this share at most is longer than LATE usual
+ones: one that sends when a command changes does not."""
+
+GAP = 5.0  # Usual intervals without a command from which on rows are left out
+
+Floats = NDArray[np.floating]
 
 
-def with_controllers_clock(raw: RawEpisode, note: Note) -> RawEpisode:
-    """The episode with each command as the mean of what the controller sent until the next row, where commands change
-    by a steady clock that is not that of the rows; else as it is.
+def sent_by_clock(time: Floats, commands: Floats) -> Floats:
+    """(T, n) the mean of the commands that a controller sent by its clock (`instants`), which shows in these rows (T,
+    n), from each time (T,) to the next."""
+    sent = instants(time, commands)
+    assert sent is not None
+    first = min(float(time[0]), float(sent[0]) - 1e-9)
+    values = commands[np.concatenate(([0], _changed(commands)))]
+    return np.column_stack([means_until_next(time, np.concatenate(([first], sent)), each) for each in values.T])
 
-    A command that shows in a row was sent between the row before and this one. The instants of all of them, one period
-    apart, are known far better than that.
+
+def instants(time: Floats, commands: Floats) -> Floats | None:
+    """The times at which commands (T, n) were sent that rows at these times (T,) show, by a steady clock; None where no
+    clock fits, or it may be that of the rows.
+
+    A command that a row is the first to show was sent between the row before and this one. The instants of all of them,
+    whole periods apart, are known far better than that.
     """
-    changed = np.flatnonzero(np.diff(raw.action, axis=0).any(1)) + 1
-    if raw.stamped_commands or len(changed) < FEWEST_CHANGES:
-        return raw
-    sent = _instants(raw.time, changed)
-    if sent is None:
-        return raw
-    period = float(np.median(np.diff(sent)))
-    note(
-        f"commands change every {period:.4g} s, by a clock that is not that of the rows: a command is the mean until "
-        "the next row",
-        raw.origin,
-    )
-    stamps, values = np.concatenate((raw.time[:1], sent)), raw.action[np.concatenate(([0], changed))]
-    means = [means_until_next(raw.time, stamps, column) for column in values.T]
-    return replace(raw, action=np.column_stack(means), stamped_commands=True)
-
-
-def _instants(time: Floats, changed: NDArray[np.intp]) -> Floats | None:
-    """The times at which commands were sent that first show in the rows `changed`, by a steady clock; None, where none
-    fits, or it may be that of the rows."""
+    changed = _changed(commands)
+    if len(changed) < FEWEST_CHANGES:
+        return None
     row = float(np.median(np.diff(time)))
-    rows = np.diff(changed)
-    gaps = np.diff(time[changed])
+    rows, gaps = np.diff(changed), np.diff(time[changed])
     # Of two commands in turn that are equal, one shows in no row; without that, rows differ by one at most.
-    single = rows <= rows.min() + 1
-    period = float(gaps[single].mean())
-    least = gcd(*rows.tolist())
+    single = gaps < (rows.min() + 1.5) * row
+    period, least = float(gaps[single].mean()), gcd(*rows.tolist())
     if period < SLOWER * row or (least == rows.min() and abs(period / (least * row) - 1) < SLOWER - 1):
         return None
     number = np.concatenate(([0.0], np.cumsum(np.where(single, 1, np.round(gaps / period)))))
-    earliest, latest = time[changed - 1] - SLACK * row, time[changed] + SLACK * row
+    slack = min(SLACK[0] * row + SLACK[1], 0.1 * row)
+    earliest, latest = time[changed - 1] - slack, time[changed] + slack
     some = np.unique(np.linspace(0, len(number) - 1, min(len(number), MOST_PAIRED)).round().astype(int))
     apart = number[some] - number[some][:, None]
     after = apart > 0
@@ -69,8 +68,26 @@ def _instants(time: Floats, changed: NDArray[np.intp]) -> Floats | None:
         return None
     clock = 0.5 * (shortest + longest) * number
     first, last = float((earliest - clock).max()), float((latest - clock).min())
-    # The last of the phases that fit: stamps that are late the diagnosis can tell from a delay, not those too early.
-    return None if first >= last else clock + last
+    # The last of the phases that fit: commands that are late the diagnosis can tell from a delay, not those too early.
+    return None if first >= last else clock + last - slack
+
+
+def _changed(commands: Floats) -> NDArray[np.intp]:
+    """The rows whose commands (T, n) are not those of the row before."""
+    return np.flatnonzero(np.diff(commands, axis=0).any(1)) + 1
+
+
+def in_gaps(time: Floats, stamps: Floats) -> NDArray[np.bool_]:
+    """Which of some times (T,) lie in a gap of the commands of a controller that else sends steadily, from when the
+    next one was due: some motors hold the last command there, others stop. `stamps` (N,) are those of the commands."""
+    intervals = np.diff(stamps)
+    if len(intervals) < FEWEST_STEADY:
+        return np.zeros(len(time), bool)
+    usual = float(np.median(intervals))
+    if np.mean(intervals > LATE * usual) > MOST_LATE:
+        return np.zeros(len(time), bool)
+    last = np.searchsorted(stamps, time, side="right").clip(1, len(intervals)) - 1
+    return (intervals[last] > GAP * usual) & (time >= stamps[last] + usual) & (time < stamps[last + 1])
 
 
 def means_until_next(time: Floats, stamps: Floats, commands: Floats) -> Floats:

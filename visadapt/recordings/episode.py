@@ -116,7 +116,7 @@ class Recording:
     resolution: tuple[float, ...] = ()
     """smallest meaningful difference of each measured state; without it, the smallest between two of its readings"""
     stamped_commands: bool = False
-    """whether the commands had stamps of their own, by which they came into the rows"""
+    """whether the commands had stamps of their own; a row holds the mean until the next one"""
 
     def __post_init__(self) -> None:
         if not self.episodes:

@@ -24,7 +24,6 @@ from visadapt.recordings.clock import (
     without_bursts,
 )
 from visadapt.recordings.columns import convert, match
-from visadapt.recordings.command_clock import with_controllers_clock
 from visadapt.recordings.csv import read_rows
 from visadapt.recordings.episode import Episode, Recording, RecordingError
 from visadapt.recordings.faulty_readings import jumps, without_outliers
@@ -106,7 +105,6 @@ def load_recording(
             check_forward(raw)
         episodes = [without_bursts(raw, note) for raw in episodes]
         check_steps(episodes, system)
-        episodes = [with_controllers_clock(raw, note) for raw in episodes]
         whole += [without_outliers(raw, system, note) for raw in without_held_readings(episodes, system, note)]
     whole = [in_flight(raw, system, note) for raw in _commands(_shared(whole, system, note), system, note)]
     check_commands(whole, system, note)

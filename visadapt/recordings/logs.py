@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from visadapt.recordings.clock import Note, RawEpisode
 from visadapt.recordings.columns import Column, check_given, if_unmeasured, needed, read_column
-from visadapt.recordings.command_clock import means_until_next
+from visadapt.recordings.command_clock import GAP, in_gaps, means_until_next
 from visadapt.recordings.episode import RecordingError
 from visadapt.recordings.topics import Read, Topic
 from visadapt.systems import RigidBody, System
@@ -35,14 +35,14 @@ named instead."""
 LEAST_STEADY = 20
 """Intervals between messages from which on a steady clock is told from one that is not."""
 
+MOST_PROMPT = 0.99
+"""Share of messages that are received within a period of the promptest, where a steady clock sent them."""
+
 STEADY = "the clock's times are used"
-"""What a note says of messages that came late, each by a time of its own."""
+"""What a note says of messages whose delays differ."""
 
 STEADY_WITHIN_S = 1e-4
 """Difference between the delays of messages up to which their stamps are left as they are."""
-
-GAP = 5.0
-"""Longest interval between a topic's readings, in median intervals, that is interpolated; longer ones have no rows."""
 
 
 def read_log(path: Path, read: Read, system: System, given: Mapping[str, str], note: Note) -> RawEpisode:
@@ -91,7 +91,7 @@ def read_log(path: Path, read: Read, system: System, given: Mapping[str, str], n
         message,
         names,
         given,
-        stamped_commands=True,
+        stamped_commands=not set(log.of_actions) & set(log.of_states),
     )
 
 
@@ -172,6 +172,11 @@ class _Log:
         for name in self.of_states:
             if name != self.slowest:
                 used &= _between_readings(time, self.topics[name].time)
+        for name in self.of_actions:
+            unknown = used & in_gaps(time, self.topics[name].time)
+            if unknown.any():
+                note(f"rows in gaps of the commands are left out: {int(unknown.sum())}", str(self.path))
+            used &= ~unknown
         rows = np.flatnonzero(used)
         if len(rows) < 2:
             raise RecordingError(f"{self.path}: {', '.join(topics)} have no time in common")
@@ -196,7 +201,7 @@ class _Log:
             values = np.unwrap(values)
         return np.interp(self.topics[self.slowest].time[rows], self.topics[topic].time, values)
 
-    def command(self, name: str, time: NDArray[np.float64]) -> NDArray[np.float64]:
+    def command(self, name: str, time: NDArray[np.float64]) -> NDArray[np.floating]:
         """The command of an action in rows with these stamps (T,)."""
         return means_until_next(time, self.topics[self.columns[name][0]].time, self.values(name))
 
@@ -236,12 +241,13 @@ def _as_sent(topic: Topic) -> tuple[Topic, float]:
     period = float(np.median(steps)) if len(steps) >= LEAST_STEADY else 0.0
     if period <= 0:
         return topic, 0.0
-    periods = np.maximum(np.round(steps / period), 1)
-    number = np.concatenate(([0.0], np.cumsum(periods)))
+    number, index = np.concatenate(([0.0], np.cumsum(np.round(steps / period)))), np.arange(len(topic.time))
+    # One that is late by more than half a period is not taken for the next.
+    number = np.minimum.accumulate((number - index)[::-1])[::-1] + index
     slope, first = np.polyfit(number, topic.time - topic.time[0], 1)
     late = topic.time - topic.time[0] - (slope * number + first)
-    sleeps = np.var(late) > np.var(steps - slope * periods)
-    if sleeps or not STEADY_WITHIN_S < np.ptp(late) < period:
+    sleeps = np.var(late) > np.var(steps - slope * np.diff(number))
+    if sleeps or np.ptp(late) <= STEADY_WITHIN_S or np.quantile(late - late.min(), MOST_PROMPT) >= period:
         return topic, 0.0
     return replace(topic, time=topic.time - (late - late.min())), float(np.ptp(late))
 

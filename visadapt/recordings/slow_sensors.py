@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from visadapt.recordings.clock import Note, RawEpisode
+from visadapt.recordings.command_clock import in_gaps
 from visadapt.recordings.runs import runs
 from visadapt.recordings.sensors import TURN, variable_of
 from visadapt.systems import System
@@ -85,19 +86,24 @@ def with_empty_cells(raw: RawEpisode, system: System, note: Note) -> RawEpisode:
 
     A column in which hardly a cell is empty stays as it is.
     """
-    first = int((~np.isnan(raw.action)).argmax(0).max())
+    first = int((~np.isnan(raw.action)).argmax(0).max(initial=0))
     if first:
-        note(f"the {first} rows before the first command are left out", raw.origin)
+        note(f"rows before the first command are left out: {first}", raw.origin)
         raw = raw.part(first, len(raw.time))
     empty = np.isnan(raw.action)
     sparse = empty.sum(0) >= FEWEST_EMPTY
     if sparse.any():
+        given = raw.time[~empty[:, sparse].any(1)]
+        unknown = in_gaps(raw.time, given)
+        if unknown.any():
+            note(f"rows in gaps of the commands are left out: {int(unknown.sum())}", raw.origin)
+            raw, empty = raw.without(unknown), empty[~unknown]
         action = raw.action.copy()
         for column in np.flatnonzero(sparse):
             rows = np.where(empty[:, column], 0, np.arange(len(action)))
             action[:, column] = action[np.maximum.accumulate(rows), column]
-            told = f"{system.actions[column].name} is empty in {int(empty[:, column].sum())} of {len(empty)} rows: held"
-            note(told, raw.origin)
+            if count := int(empty[:, column].sum()):
+                note(f"{system.actions[column].name} is empty in {count} of {len(empty)} rows: held", raw.origin)
         raw = replace(raw, action=action)
     missing = np.isnan(raw.state)
     sparse = (missing.sum(0) >= FEWEST_EMPTY) & ~missing.all(0)

@@ -22,7 +22,7 @@ MOST_UNSTAMPED = 0.1
 """Share of a topic's messages whose header has no stamp up to which these are left out."""
 SAME_CLOCK_S = 0.05
 """Median difference between the stamps in headers and the times of recording up to which both are of one clock."""
-RECORDED = "its stamps are the times at which its messages were recorded: their delays are in the clock"
+RECORDED = "its stamps are the times at which its messages were recorded"
 """The note on a topic whose messages have no stamps of their own."""
 ULOG_HEADER = 3
 """Bytes of the header of a message of ULog: size and kind."""

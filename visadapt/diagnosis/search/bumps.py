@@ -82,7 +82,7 @@ def summed(
     loads: Sequence[Variable],
     tries: int,
 ) -> Push:
-    """The push whose shape is the sum of overlapping bumps, raised to its impulse where all are of one sign.
+    """The push whose shape is the sum of overlapping bumps; if all have one sign, its peak is scaled with its impulse.
 
     Args:
         impulse: over the root mean square of the joint's load, s.
@@ -96,8 +96,9 @@ def summed(
     heights, middles, widths = np.array([(one.height, one.middle, one.width) for one in bumps]).T
     shape = unit * np.exp(-0.5 * ((time[:, None] - middles) / widths) ** 2) @ heights
     during = time[shape / shape[np.abs(shape).argmax()] >= EDGE_SHARE]
-    raised = impulse / sum(one.height * one.area for one in bumps)
-    peak = float(shape[np.abs(shape).argmax()]) * (raised if raised > 0 and np.ptp(np.sign(heights)) == 0 else 1.0)
+    peak = float(shape[np.abs(shape).argmax()])
+    if np.ptp(np.sign(heights)) == 0 and impulse * peak > 0:
+        peak *= impulse / sum(one.height * one.area for one in bumps)
     impulse, spread = unit * impulse, Z_90 * unit * math.hypot(deviation, MODEL_ERROR * impulse)
     p_value = min(1.0, tries * math.erfc(max(one.score for one in bumps) / math.sqrt(2)))
     start, end = max(0.0, float(during[0])), float(during[-1])

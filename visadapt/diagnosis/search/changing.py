@@ -5,77 +5,92 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import torch
-from torch import Tensor
 
-from visadapt.diagnosis.search.fitted_models import FittedModels, ScoredModel, key_of
+from visadapt.diagnosis.search.fitted_models import FittedModels, NoFitError, ScoredModel, key_of
 from visadapt.diagnosis.search.search import Search
-from visadapt.effects import Role
-from visadapt.estimation.fit_states import CAREFUL, with_effect
+from visadapt.effects import Effect, Role
+from visadapt.estimation.fit_states import CAREFUL, neutral, posterior, with_effect
 
 MOST_PARTS, FEWEST_PARTS = 6, 3
-"""Stretches of a recording to which the same effects are fitted, each with sizes of its own: as many as there are
-windows, within these limits."""
+"""A recording is cut into MOST_PARTS stretches, or its windows, where these are fewer, but FEWEST_PARTS at least."""
 
 MOST_TRIED = (4, 2)
 """Sets of one effect and of two that are tried, the most probable first: of two where no single one explains all."""
 
 MIN_LOG_ODDS = 10.0  # By which they must be likelier so than with one size: each stretch pays for sizes of its own
 
+MIN_CHANGE = 4.0
+"""Deviations by which the size of an effect must depart from its mean in a stretch: the noise may change as well."""
+
 MAX_LEFT = 0.15
 """Share of what the set leaves to process noise with one size that it may leave with one for each stretch, the stretch
-with most of it aside: there a load may have been dropped. Foreign effects left half of it or more."""
+with most of it aside: there a load may have been dropped. Sets that were not what changed left half of it or more."""
 
 AS_LIKELY = 5.0  # Log odds behind the best set up to which another one is said too
 
-IN_TIME = {Role.START, Role.END, Role.FREQUENCY, Role.PHASE}  # of parameters of effects that say when they act
+IN_TIME = {Role.START, Role.END, Role.FREQUENCY, Role.PHASE}
+"""Roles of parameters of effects that act in a region of a state or of time, or periodically: these are not tried."""
 
 
 @dataclass(frozen=True)
 class Changing:
     """A set of effects that explains every stretch of a recording, with other sizes in each."""
 
-    fits: tuple[ScoredModel, ...]  # in the order of time
+    effects: tuple[type[Effect], ...]
+    values: tuple[tuple[float, ...], ...]  # of their parameters, in each stretch, in the order of time
     log_odds: float
 
 
 def changing(search: Search) -> tuple[Changing, ...]:
     """What explains a recording if its sizes may change within it, the most probable first; nothing, where they do not
     or that does not explain it either."""
-    parts = _stretches(search)
-    if len(parts) < FEWEST_PARTS:
+    count = search.rows.shape[0]
+    if count < FEWEST_PARTS:
         return ()
-    fitted = [FittedModels(search.system, search.rows.select(part), search.catalogue) for part in parts]
+    parts = torch.arange(count).tensor_split(min(MOST_PARTS, count))
+    try:
+        stretches = [
+            FittedModels(search.system, search.rows.select(part), search.catalogue, jobs=search.jobs) for part in parts
+        ]
+    except NoFitError:
+        return ()
+    best = search.best.log_odds
     for tried in _tried(search):
-        if found := [one for each in tried if (one := _in_stretches(search, fitted, each))]:
+        found = [one for each in tried if (one := _in_stretches(search, stretches, each))]
+        if found := [one for one in found if one.log_odds > best + MIN_LOG_ODDS]:
             found.sort(key=lambda one: -one.log_odds)
             return tuple(one for one in found if one.log_odds >= found[0].log_odds - AS_LIKELY)
     return ()
 
 
 def _in_stretches(search: Search, stretches: Sequence[FittedModels], whole: ScoredModel) -> Changing | None:
-    """A set fitted to each stretch, if that explains the recording."""
+    """A set with sizes of its own in each stretch, if they change, and that explains the recording."""
     start = whole.fits.theta[0].tolist()
     fits = [each.fit([(whole.effects, with_effect(each.source.fits, start))], CAREFUL)[0] for each in stretches]
     left = sorted(each.without_process_noise([fit])[0].left for each, fit in zip(stretches, fits, strict=True))
-    fits = [each.fitted[key_of(whole.effects)] for each in stretches]  # perhaps a better one, without process noise
-    # In a stretch in which nothing acts, the recording says nothing about the set, and the source is the answer.
-    log_odds = sum(max(fit.log_odds, each.source.log_odds) for each, fit in zip(stretches, fits, strict=True))
-    found = Changing(tuple(fits), log_odds)
-    if found.log_odds <= search.best.log_odds + MIN_LOG_ODDS:
+    if sum(left[:-1]) > MAX_LEFT * search.without_process_noise([whole])[0].left:
         return None
-    return found if sum(left[:-1]) <= MAX_LEFT * search.without_process_noise([whole])[0].left else None
+    fits = [each.fitted[key_of(whole.effects)] for each in stretches]  # perhaps a better one, without process noise
+    if not _change(fits):
+        return None
+    nothing = tuple(value for effect in whole.effects for value in neutral(effect))
+    # In a stretch in which nothing acts, the recording says nothing about the set, and the source is the answer.
+    acts = [fit.log_odds > each.source.log_odds for each, fit in zip(stretches, fits, strict=True)]
+    values = [tuple(fit.fits.theta[0].tolist()) if act else nothing for fit, act in zip(fits, acts, strict=True)]
+    log_odds = sum(max(fit.log_odds, each.source.log_odds) for each, fit in zip(stretches, fits, strict=True))
+    return Changing(whole.effects, tuple(values), log_odds)
 
 
-def _stretches(search: Search) -> list[Tensor]:
-    """The windows of each stretch, in the order of time."""
-    rows = search.rows
-    order = sorted(range(rows.shape[0]), key=lambda k: (int(rows.episode[k]), float(rows.time[k, 0])))
-    count = min(MOST_PARTS, len(order))
-    edges = [len(order) * k // count for k in range(count + 1)]
-    return [torch.tensor(sorted(order[a:b])) for a, b in pairwise(edges)]
+def _change(fits: Sequence[ScoredModel]) -> bool:
+    """Whether a parameter departs from its mean over the stretches by more than the noise."""
+    values = torch.cat([fit.fits.theta for fit in fits])
+    variance = torch.stack(
+        [torch.linalg.inv_ex(posterior(fit.effects, fit.fits)[1]).inverse.diagonal().clamp(min=0) for fit in fits]
+    )
+    mean = (values / variance).sum(0) / variance.reciprocal().sum(0)
+    return bool(((values - mean).abs() > MIN_CHANGE * variance.sqrt()).any())
 
 
 def _tried(search: Search) -> list[list[ScoredModel]]:

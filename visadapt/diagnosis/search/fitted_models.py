@@ -233,6 +233,8 @@ class FittedModels:
 
 def _is_better(one: ScoredModel, other: ScoredModel) -> bool:
     """Whether a fit is better than another one of the same set."""
+    if not (math.isfinite(one.fits.likelihood[0]) and math.isfinite(other.fits.likelihood[0])):
+        return math.isfinite(one.fits.likelihood[0])
     if math.inf in (-one.log_odds, -other.log_odds):
         # A likelier fit about which the recording is uninformative shows that the other one has stopped short of it.
         gain = float(one.fits.likelihood[0] - other.fits.likelihood[0])

@@ -50,24 +50,24 @@ def log_posterior_odds(effects: Effects, fits: FitState, catalogue: int) -> floa
 
 
 def _uninformed(effects: Effects, fits: FitState, variance: Tensor, precision: Tensor) -> bool:
-    """Whether all strengths of an effect may be zero, or all of several shapes are undetermined, or a simpler effect
-    does the same, for any effect."""
+    """Whether, for any effect, all strengths are within a standard deviation or two of neutral, or all of several
+    shapes are undetermined, or a simpler effect does the same."""
     first = 0
     for effect in effects:
         if effect.is_simpler(fits.theta[0, first : first + len(effect.table)].tolist()):
             return True
         strengths, shapes = [], []
-        bounded = sum(parameter.neutral is None for parameter in effect.table) > 1
+        several_shapes = sum(parameter.neutral is None for parameter in effect.table) > 1
         for k, parameter in enumerate(effect.table, first):
             undetermined = float(variance[k] * precision[k]) > MAX_VARIANCE_RATIO
             if parameter.neutral is None:
                 shapes.append(undetermined)
             else:
                 size = abs(float(fits.theta[0, k]) - parameter.neutral)
-                # Where an effect acts for a moment, or in a narrow place, its force times that width is known, and
-                # neither by itself: a blow, which no law of the catalogue describes, and a push of the report.
-                least = 2 if undetermined or bounded else 1
-                strengths.append(size < least * math.sqrt(float(variance[k])))
+                # Of an effect for a moment, or in a narrow place, the recording shows force times width, and neither by
+                # itself: a blow, which the report gives as a push.
+                deviations = 2 if undetermined or several_shapes else 1
+                strengths.append(size < deviations * math.sqrt(float(variance[k])))
         first += len(effect.table)
         # A single shape may be undetermined by trading off with another effect's strength: a spring's rest and a force.
         if (strengths and all(strengths)) or (len(shapes) > 1 and all(shapes)):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from statistics import median
 
 import numpy as np
 import torch
@@ -12,11 +14,12 @@ from torch import Tensor
 
 from visadapt.diagnosis.result import Push
 from visadapt.diagnosis.search import angle_defect, sensor_checks, sign_conventions
+from visadapt.diagnosis.search.command_times import Move, a_row_earlier, earlier, mean_until_next, sent_until_next_row
 from visadapt.diagnosis.search.held_joints import without_held_joints
 from visadapt.diagnosis.search.motor_off import without_idle_ends
 from visadapt.diagnosis.search.pushed_rows import pushed_rows
 from visadapt.diagnosis.search.search import Search
-from visadapt.diagnosis.words import A_ROW_LATE, DERIVED, OPPOSITE, PART_LATE, number, with_unit
+from visadapt.diagnosis.words import A_ROW_LATE, DERIVED, OPPOSITE, OWN_CLOCK, PART_LATE, number
 from visadapt.effects import Effect
 from visadapt.estimation.integration_step import with_longest_step
 from visadapt.estimation.likelihood import FitState
@@ -25,6 +28,7 @@ from visadapt.estimation.repeated_readings import RepeatedReadings, find_repeats
 from visadapt.estimation.segments import Segments, Stretch, cut, smoothly_filled, stretches_without
 from visadapt.estimation.unmeasured_states import with_unmeasured
 from visadapt.recordings import Episode, Recording
+from visadapt.recordings.command_clock import instants
 from visadapt.recordings.runs import runs
 from visadapt.recordings.thinning import spread
 from visadapt.systems import System
@@ -56,12 +60,13 @@ EVEN_LOG_ODDS = 5.0
 """Log likelihood that evenly spaced stamps must gain over those recorded: at rest, both fit alike."""
 
 EARLIER_LOG_ODDS = 20.0
-"""Log likelihood that commands a row earlier than recorded must gain: no machine answers before it is asked."""
+"""Log likelihood that commands moved in time must gain: no machine answers before it is asked."""
 
-MIN_PART = 0.02  # Share of a row by which commands must be early to be moved
+MIN_PART = 0.02  # Share of a row by which commands must act early to be moved
 
 MOST_BESIDE_LATE = 2
-"""Most effects that are fitted beside commands whose own stamps may be late: that the stamps are is common."""
+"""Most effects that are fitted beside the lateness of commands that have stamps of their own, which often are late.
+None are fitted beside that of others, which is rare."""
 
 MOST_FILLED = 2
 """Rows in a row whose readings are filled in by cubics: the acceleration in more of them would be made up."""
@@ -163,7 +168,7 @@ class _Readings:
             kept = _without_long_runs((used > 0).all(1).numpy())
             read = None if slowest is None else used[:, slowest].nonzero()[:, 0]
             if read is not None and len(read) > 1:
-                time, action, filled = time[read], means_until_next(action, time, read), filled[read]
+                time, action, filled = time[read], mean_until_next(action, time, read), filled[read]
                 kept = np.ones(len(read), bool)
             episodes.append(Episode(time.numpy(), action.numpy(), filled.numpy()))
             usable.append(np.repeat(kept[:, None], len(self.channels), 1))
@@ -316,81 +321,84 @@ def _in_signs_of_source(draft: _Draft, first: FitState, catalogue: Sequence[type
 
 
 def _with_commands_that_act(draft: _Draft, catalogue: Sequence[type[Effect]]) -> _Draft:
-    """With the commands earlier by a row, where the recording has each beside the readings that it led to, or by part
-    of a row, where their stamps are late."""
-    as_given, a_row = (_Earlier.of(draft, catalogue, share) for share in (0.0, 1.0))
-    by_rows = not draft.readings.recording.stamped_commands
+    """With the commands when they act: by their controller's clock, where that is not the rows'; earlier by a row,
+    where the recording has each beside the readings that it led to; or earlier by part of a row."""
+    given = _MovedCommands.of(draft, catalogue, None)
+    stamped = draft.readings.recording.stamped_commands
+    if not stamped and (period := _controllers_period(draft.readings)) is not None:
+        by_clock = _MovedCommands.of(draft, catalogue, sent_until_next_row)
+        if sign_conventions.stays_ahead(by_clock.search, given.search, EARLIER_LOG_ODDS):
+            draft = by_clock.told(f"commands change every {number(period)} s, {OWN_CLOCK}")
+            given, stamped = replace(by_clock, draft=draft), True
+    a_row = _MovedCommands.of(draft, catalogue, a_row_earlier)
     # Commands that are late by less than a row are, a row earlier, those of a machine with a delay.
-    if by_rows and sign_conventions.stays_ahead(
-        a_row.search, as_given.search, EARLIER_LOG_ODDS, a_row.search.fit_delays
+    if not stamped and sign_conventions.stays_ahead(
+        a_row.search, given.search, EARLIER_LOG_ODDS, a_row.search.fit_delays
     ):
-        told = f"each command is recorded a row late, beside the readings that it led to: {A_ROW_LATE}"
-        return a_row.told(told)
-    share = 1 - a_row.delay_in_rows(beside=0 if by_rows else MOST_BESIDE_LATE)
-    if share > MIN_PART:
-        part = _Earlier.of(draft, catalogue, share)
-        if sign_conventions.stays_ahead(part.search, as_given.search, EARLIER_LOG_ODDS):
-            late = with_unit(number(share * draft.rows.period, 2), "s")
-            return part.told(f"the commands act {late} before their stamps, which are late: {PART_LATE}")
-    return replace(draft, source=as_given.search.source.fits)
+        return a_row.told(f"each command is recorded a row late, beside the readings that it led to: {A_ROW_LATE}")
+    late = draft.rows.period - a_row.delay(MOST_BESIDE_LATE if stamped else 0)
+    if late > MIN_PART * draft.rows.period:
+        part = _MovedCommands.of(draft, catalogue, partial(earlier, by=late))
+        if sign_conventions.stays_ahead(part.search, given.search, EARLIER_LOG_ODDS):
+            return part.told(f"the commands act {number(late, 2)} s before the rows that they are in: {PART_LATE}")
+    return replace(draft, source=given.search.source.fits)
+
+
+def _controllers_period(readings: _Readings) -> float | None:
+    """The median period, in s, of the controller's clock in each episode; None, if one shows no clock but the rows'."""
+    periods = []
+    for stamps, command in zip(readings.stamps, readings.commands, strict=True):
+        sent = instants(stamps.numpy(), command.numpy())
+        if sent is None:
+            return None
+        periods.append(float(np.diff(sent).mean()))
+    return median(periods)
 
 
 @dataclass(frozen=True)
-class _Earlier:
-    """A draft whose commands are earlier by a share of a row."""
+class _MovedCommands:
+    """A draft whose commands are moved in time."""
 
     draft: _Draft
-    share: float
+    move: Move | None
     rows: Segments
     raw: Segments
     search: Search
 
     @classmethod
-    def of(cls, draft: _Draft, catalogue: Sequence[type[Effect]], share: float) -> _Earlier:
-        """The draft with its commands earlier."""
+    def of(cls, draft: _Draft, catalogue: Sequence[type[Effect]], move: Move | None) -> _MovedCommands:
+        """The draft with its commands moved; without `move`, as they are."""
         system, rows, raw = draft.readings.system, draft.rows, draft.raw
-        if share:
-            rows, raw = (replace(one, command=_earlier(one.command, 1, share)) for one in (rows, raw))
+        if move is not None:
+            command = rows.command.clone()
+            for episode, stamps in enumerate(draft.readings.stamps):
+                command[episode, : len(stamps)] = move(command[episode, : len(stamps)], stamps)
+            rows, raw = (replace(one, command=command) for one in (rows, raw))
             rows, raw = _with_unmeasured(rows, raw, system)
-        source = None if share else draft.source
-        return cls(draft, share, rows, raw, Search(system, rows.select(draft.searched), catalogue, source))
+        source = draft.source if move is None else None
+        return cls(draft, move, rows, raw, Search(system, rows.select(draft.searched), catalogue, source))
 
-    def delay_in_rows(self, beside: int) -> float:
-        """The machine's delay that fits best, up to so many other effects `beside` it; a row, where no delay is among
-        the effects searched."""
+    def delay(self, beside: int) -> float:
+        """The machine's delay, in s, that fits best, with up to so many other effects `beside` it; a row, where no
+        delay is among the effects searched."""
         sets = self.search.fit_delays(0.9)
         if not sets:
-            return 1.0
+            return self.rows.period
         best = max(sets, key=lambda one: one.log_odds)
         delay, before = best.effects[0], None
         while best is not before and len(best.effects) <= beside:
             before = best
             grown = self.search.extend([best], sign_conventions.LEADS)
             best = max((best, *grown), key=lambda one: one.log_odds)
-        return float(best.by_effect(best.fits.theta[0])[delay]) / self.rows.period
+        return float(best.by_effect(best.fits.theta[0])[delay])
 
     def told(self, warning: str) -> _Draft:
-        """The draft as it goes on."""
+        """The draft with its commands moved, and a warning of it."""
+        assert self.move is not None
         readings = self.draft.readings
-        commands = [_earlier(each, 0, self.share) for each in readings.commands]
+        commands = [self.move(each, stamps) for each, stamps in zip(readings.commands, readings.stamps, strict=True)]
         moved = replace(self.draft, readings=replace(readings, commands=commands))
         return moved.changed(self.rows, self.raw, warning)
-
-
-def _earlier(command: Tensor, dim: int, share: float) -> Tensor:
-    """Commands, held for a row each along a dimension, that come earlier by a share of a row: the means of their rows.
-    The last stays."""
-    count = command.shape[dim]
-    following = command.index_select(dim, torch.arange(1, count + 1).clamp(max=count - 1))
-    return torch.lerp(command, following, share)
-
-
-def means_until_next(command: Tensor, stamps: Tensor, rows: Tensor) -> Tensor:
-    """(R, n) of commands (T, n) at stamps (T,), the mean over time from each of some `rows` (R,) until the next."""
-    held = torch.diff(stamps, append=stamps[-1:])
-    total = torch.cat((torch.zeros_like(command[:1]), (held[:, None] * command).cumsum(0)))
-    means = total[rows].diff(dim=0) / stamps[rows].diff()[:, None]
-    return torch.cat((means, command[rows[-1:]]))
 
 
 def _evenly_spaced(stamps: Tensor) -> Tensor:

@@ -122,6 +122,7 @@ class _Fit:
     bumps: list[Bump]  # B on a part
     residual: list[Tensor]  # P times (N, J): the load less all that is fitted
     weights: list[Tensor]  # P times (M,): of the columns, the loads held by dry friction, and the bumps
+    common: Tensor  # (K,) weights of the columns that the parts have in common
     roots: list[Tensor]  # P times (M, M): Cholesky factors of the weights' precision
     held: list[Tensor]  # P times (H, N, J): loads by which dry friction may hold a joint at rest (H differs)
     spread: list[Tensor]  # P times (N, J): deviation of the errors
@@ -231,7 +232,7 @@ class _Fit:
                 gradient = gradient[:count] - gone @ gradient[count:]
                 inner = identity + EPISODE_PRIOR**2 * normal
                 total, along = total + torch.linalg.solve(inner, normal), along + torch.linalg.solve(inner, gradient)
-        common = torch.linalg.solve(total, along)
+        self.common = common = torch.linalg.solve(total, along)
         for part, (normal, gradient) in enumerate(problems):
             precision = torch.ones(len(normal), dtype=torch.float64)
             if several:
@@ -323,8 +324,8 @@ class _Fit:
 
     def _impulse(self, group: Sequence[Bump]) -> tuple[float, float]:
         """The impulse of some overlapping bumps on a part, over the load's root mean square, and its standard
-        deviation: of a load of any shape in their place, so that what moves with a push, as the states that it throws
-        far out do, takes none of it."""
+        deviation: of a load of any shape in their place. Columns that a push makes large, by throwing states far out,
+        would explain part of a bump."""
         part, joint = group[0].part, group[0].joint
         track, others = self.tracks[part], [one for one in self.bumps if one not in group]
         during = torch.zeros(len(track.time), dtype=torch.bool)
@@ -339,8 +340,13 @@ class _Fit:
         kept = [BUMP_PRIOR * one.on(track) for one in others if one.part == part]
         design = self._whitened(part, torch.cat((columns, free, *(one[None] for one in kept))))
         weighted = design * (OUTLIER / self._whitened(part, self.residual[part]).abs().clamp(min=1e-9)).clamp(max=1)
-        root = torch.linalg.cholesky(weighted @ design.T + torch.eye(len(design), dtype=torch.float64))
-        weights = torch.cholesky_solve((weighted @ self._whitened(part, track.load))[:, None], root)[:, 0]
+        precision, towards = torch.ones(len(design), dtype=torch.float64), torch.zeros(len(design), dtype=torch.float64)
+        if len(self.tracks) > 1:
+            precision[: len(self.common)] = EPISODE_PRIOR**-2
+            towards[: len(self.common)] = EPISODE_PRIOR**-2 * self.common
+        root = torch.linalg.cholesky(weighted @ design.T + torch.diag(precision))
+        along = weighted @ self._whitened(part, track.load) + towards
+        weights = torch.cholesky_solve(along[:, None], root)[:, 0]
         areas = pad(torch.full((len(free),), prior * step, dtype=torch.float64), (len(columns), len(kept)))
         deviation = torch.linalg.solve_triangular(root, areas[:, None], upper=False).square().sum().sqrt()
         return float(areas @ weights), float(deviation)

@@ -95,7 +95,9 @@ class Search(FittedModels):
         self.fit([each for each in starts if each[0]], QUICK)
         self.extend([self.source])
         exchanged, settled = Exchanges(), None
-        while self.best.names != settled:
+        for _ in range(MAX_EFFECTS):
+            if self.best.names == settled:
+                break
             self.grow_best(progress)
             settled = self.best.names
             if exchange:

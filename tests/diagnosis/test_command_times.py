@@ -1,0 +1,58 @@
+"""Recordings whose rows do not hold the commands that act: the diagnosis puts them where they act, and says so."""
+
+import numpy as np
+import pytest
+import torch
+
+from visadapt.diagnosis import diagnose
+from visadapt.diagnosis.search.preparation import prepare
+from visadapt.diagnosis.words import OWN_CLOCK
+from visadapt.effects import ActuatorDelay, ActuatorGain, ViscousFriction
+from visadapt.recordings import Episode, Recording
+from visadapt.recordings.command_clock import instants
+from visadapt.systems import CartPole
+from visadapt.world import World
+
+STEP, EPISODES = 0.001, 2
+CATALOGUE = [ViscousFriction, ActuatorGain, ActuatorDelay]
+
+
+def recorded(row, due, effects=()):
+    """6 s of balanced cart-poles, read every `row` steps of 1 ms, whose command is computed anew where `due`, of the
+    number of a step, says so."""
+    generator = torch.Generator().manual_seed(0)
+    world = World(CartPole(), [effect.double() for effect in effects], STEP)
+    gains = torch.tensor([0.08, 0.12, 1.3, 0.3], dtype=torch.float64)
+    at = world.start(0.05 * torch.randn(EPISODES, 4, generator=generator, dtype=torch.float64))
+    command, states, commands = torch.zeros(EPISODES, 1, dtype=torch.float64), [], []
+    with torch.no_grad():
+        for step in range(6000):
+            if due(step):
+                noise = torch.randn(EPISODES, 1, generator=generator, dtype=torch.float64)
+                command = ((at.state * gains).sum(1, keepdim=True) + 0.04 * noise).clamp(-1, 1)
+            if step % row == 0:
+                states.append(at.state[:, [0, 2]])
+                commands.append(command)
+            at = world.step(at, command)
+    clean, action = torch.stack(states, 1), torch.stack(commands, 1).numpy()
+    state = (clean + 0.001 * torch.randn(clean.shape, generator=generator, dtype=torch.float64)).numpy()
+    time = STEP * row * np.arange(len(states))
+    episodes = tuple(Episode(time, action[k], state[k]) for k in range(EPISODES))
+    return Recording(episodes, ("x", "theta"), STEP * row, tuple(f"run.csv, episode {k}" for k in range(EPISODES)))
+
+
+@pytest.mark.parametrize("effects", [(), [ViscousFriction(coefficient=2.0)]])
+def test_commands_act_when_a_controller_of_its_own_clock_sent_them(effects):
+    recording = recorded(13, lambda step: step % 20 == 7, effects)
+    found = diagnose(recording, World(CartPole()), CATALOGUE)
+    assert [said for said in found.warnings if OWN_CLOCK in said] == [f"commands change every 0.0200 s, {OWN_CLOCK}"]
+    assert [cause.effect for cause in found.causes] == [effect.name for effect in effects]
+    assert found.verdict == ("identified" if effects else "no_gap")
+
+
+def test_commands_of_the_loop_that_reads_act_from_their_rows_on():
+    # Steps of 33 ms, which a loop of 10 ms can begin in a row alone.
+    recording = recorded(10, lambda step: step % 10 == 0 and step // 33 != (step - 10) // 33)
+    episode = recording.episodes[0]
+    assert instants(episode.time, episode.action) is not None  # a clock of its own would show the same commands
+    assert not any(OWN_CLOCK in said for said in prepare(recording, CartPole(), CATALOGUE).warnings)
