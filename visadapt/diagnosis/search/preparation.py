@@ -381,11 +381,11 @@ class _MovedCommands:
     def delay(self, beside: int) -> float:
         """The machine's delay, in s, that fits best, with up to so many other effects `beside` it; a row, where no
         delay is among the effects searched."""
-        sets = self.search.fit_delays(0.9)
+        sets = self.search.fit_late_commands()
         if not sets:
             return self.rows.period
-        best = max(sets, key=lambda one: one.log_odds)
-        delay, before = best.effects[0], None
+        best, before = sets[0], None
+        delay = best.effects[0]
         while best is not before and len(best.effects) <= beside:
             before = best
             grown = self.search.extend([best], sign_conventions.LEADS)

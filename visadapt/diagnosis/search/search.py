@@ -16,7 +16,7 @@ from itertools import combinations
 
 from visadapt.diagnosis.search.fitted_models import MIN_BETTER, FittedModels, ScoredModel, key_of, less
 from visadapt.effects import ActuationEffect, Effect
-from visadapt.effects.late_sensors import LateSensors
+from visadapt.effects.late_sensors import LateSensors, MeasurementDelay
 from visadapt.estimation.episode_phases import has_episode_phases, with_episode_phases
 from visadapt.estimation.fit_states import CAREFUL, QUICK, Effects, neutral, with_effect
 from visadapt.estimation.fitting import OUT_OF_REACH
@@ -190,9 +190,20 @@ class Search(FittedModels):
         bases = {each.names: each for each in (self.source, self.best, *alone[:LATE_BASES])}
         return self._fit_late([(base.effects, base.fits) for base in bases.values()])
 
-    def fit_delays(self, start: float = 0.5) -> list[ScoredModel]:
-        """Each delay alone, which starts at a share of a period."""
-        delays = [effect for effect in self.catalogue if [p.name for p in effect.table] == ["delay"]]
+    def fit_delays(self) -> list[ScoredModel]:
+        """Each delay alone, which starts at half a period."""
+        return self._fit_delays([effect for effect in self.catalogue if _is_delay(effect)], 0.5)
+
+    def fit_late_commands(self) -> list[ScoredModel]:
+        """The delay of all commands alone, or of all readings, which does the same, from nearly a period on; none, if
+        it is not in the catalogue."""
+        delays = [effect for effect in self.catalogue if _is_delay(effect)]
+        readings = [effect for effect in delays if issubclass(effect, MeasurementDelay)]
+        commands = [effect for effect in delays if issubclass(effect, ActuationEffect)]
+        return self._fit_delays([*readings, *commands][:1], 0.9)
+
+    def _fit_delays(self, delays: Sequence[type[Effect]], start: float) -> list[ScoredModel]:
+        """Delays alone, which start at a share of a period."""
         return self.fit([((e,), with_effect(self.source.fits, [start * self.rows.period])) for e in delays], QUICK)
 
     def _grow_late(self, late: Sequence[ScoredModel]) -> None:
@@ -346,6 +357,10 @@ def _imitates(one: ScoredModel, other: ScoredModel) -> bool:
     where it does not differ."""
     more = one.fits.theta.shape[1] - other.fits.theta.shape[1]
     return more > 0 and float(one.fits.likelihood[0] - other.fits.likelihood[0]) < more
+
+
+def _is_delay(effect: type[Effect]) -> bool:
+    return [parameter.name for parameter in effect.table] == ["delay"]
 
 
 def _is_slow(effect: type[Effect]) -> bool:
