@@ -51,12 +51,14 @@ def test_its_size_is_said_from_stretch_to_stretch(effect, parameter, values):
 class Ridges(CartForce):
     """A force that no effect of the catalogue describes, and that is always the same."""
 
-    name = "ridges"
     equation = "F = 2 sin(60 x)"
     table = ()
 
     def push(self, time, state, system):
         return 2 * (60 * state[:, 0]).sin()
+
+
+Ridges.name = "ridges"  # only now, so that it is in no catalogue
 
 
 @pytest.mark.parametrize("effects", [(), [ViscousFriction(coefficient=2.0)], [Ridges()]])

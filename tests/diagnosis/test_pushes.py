@@ -15,7 +15,7 @@ from visadapt.diagnosis import diagnose
 from visadapt.diagnosis.search.preparation import prepare
 from visadapt.diagnosis.search.pushes import pushes
 from visadapt.diagnosis.search.unexplained_load import unread_states
-from visadapt.effects import ActuatorSaturation, CoulombFriction
+from visadapt.effects import ActuatorSaturation, CoulombFriction, DynamicsEffect
 from visadapt.effects.catalogue import catalogue
 from visadapt.recordings import Episode, Recording
 from visadapt.systems import CartPole
@@ -296,3 +296,41 @@ def test_none_is_named_where_readings_were_lost(rate):
     whole = prepare(dataclasses.replace(recording, episodes=tuple(episodes)), CartPole()).whole
     with torch.inference_mode():
         assert pushes(whole, World(CartPole())) == ()
+
+
+class Tap(DynamicsEffect):
+    """A finger that taps the pole: half a sine of torque, from 3.00 to 3.15 s, and no other effect."""
+
+    equation = "Q_theta = 0.4 sin(pi (t - 3) / 0.15)"
+    table = ()
+
+    def load(self, time, state, system):
+        torque = 0.4 * (math.pi * (time - 3.0) / 0.15).sin() * ((time > 3.0) & (time < 3.15))
+        return torch.stack((torch.zeros_like(state[:, 0]), torque.expand(len(state))), -1)
+
+
+class Blow(DynamicsEffect):
+    """A stop that the cart hits, in 20 ms: shorter than a row."""
+
+    equation = "Q_x = 40 exp(-((t - 2.52) / 0.01)^2)"
+    table = ()
+
+    def load(self, time, state, system):
+        force = 40 * (-((time - 2.52) / 0.01).square()).exp()
+        return torch.stack((force.expand(len(state)), torch.zeros_like(state[:, 0])), -1)
+
+
+Tap.name, Blow.name = "tap", "blow"  # only now, so that they are in no catalogue
+
+
+@pytest.mark.parametrize(
+    ("effect", "load", "impulse"),
+    [(Tap, "pivot_torque", 0.4 * 0.15 * 2 / math.pi), (Blow, "cart_force", 40 * 0.01 * math.sqrt(math.pi))],
+)
+def test_of_a_short_push_the_impulse_is_said_and_no_effect_is_named(effect, load, impulse):
+    found = diagnose(record([effect()], 2, rows=120), World(CartPole()))
+    assert (found.verdict, found.causes) == ("unexplained", ())
+    assert [(push.load, push.episode) for push in found.where.pushes] == [(load, 0), (load, 1)]
+    for push in found.where.pushes:
+        assert push.ci90[0] < impulse < push.ci90[1]
+        assert push.impulse == pytest.approx(impulse, rel=0.2)

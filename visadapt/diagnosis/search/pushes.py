@@ -122,7 +122,6 @@ class _Fit:
     bumps: list[Bump]  # B on a part
     residual: list[Tensor]  # P times (N, J): the load less all that is fitted
     weights: list[Tensor]  # P times (M,): of the columns, the loads held by dry friction, and the bumps
-    common: Tensor  # (K,) weights of the columns that the parts have in common
     roots: list[Tensor]  # P times (M, M): Cholesky factors of the weights' precision
     held: list[Tensor]  # P times (H, N, J): loads by which dry friction may hold a joint at rest (H differs)
     spread: list[Tensor]  # P times (N, J): deviation of the errors
@@ -232,7 +231,7 @@ class _Fit:
                 gradient = gradient[:count] - gone @ gradient[count:]
                 inner = identity + EPISODE_PRIOR**2 * normal
                 total, along = total + torch.linalg.solve(inner, normal), along + torch.linalg.solve(inner, gradient)
-        self.common = common = torch.linalg.solve(total, along)
+        common = torch.linalg.solve(total, along)
         for part, (normal, gradient) in enumerate(problems):
             precision = torch.ones(len(normal), dtype=torch.float64)
             if several:
@@ -340,13 +339,9 @@ class _Fit:
         kept = [BUMP_PRIOR * one.on(track) for one in others if one.part == part]
         design = self._whitened(part, torch.cat((columns, free, *(one[None] for one in kept))))
         weighted = design * (OUTLIER / self._whitened(part, self.residual[part]).abs().clamp(min=1e-9)).clamp(max=1)
-        precision, towards = torch.ones(len(design), dtype=torch.float64), torch.zeros(len(design), dtype=torch.float64)
-        if len(self.tracks) > 1:
-            precision[: len(self.common)] = EPISODE_PRIOR**-2
-            towards[: len(self.common)] = EPISODE_PRIOR**-2 * self.common
-        root = torch.linalg.cholesky(weighted @ design.T + torch.diag(precision))
-        along = weighted @ self._whitened(part, track.load) + towards
-        weights = torch.cholesky_solve(along[:, None], root)[:, 0]
+        # Columns have no prior from the other parts, whose pushes the bumps may have left to them.
+        root = torch.linalg.cholesky(weighted @ design.T + torch.eye(len(design), dtype=torch.float64))
+        weights = torch.cholesky_solve((weighted @ self._whitened(part, track.load))[:, None], root)[:, 0]
         areas = pad(torch.full((len(free),), prior * step, dtype=torch.float64), (len(columns), len(kept)))
         deviation = torch.linalg.solve_triangular(root, areas[:, None], upper=False).square().sum().sqrt()
         return float(areas @ weights), float(deviation)
