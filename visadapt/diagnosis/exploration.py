@@ -12,10 +12,11 @@ from visadapt.diagnosis.search.apart import ExplainedAlone, explained_apart
 from visadapt.diagnosis.search.causes import Alternative, alternatives
 from visadapt.diagnosis.search.changing import Changing, changing
 from visadapt.diagnosis.search.coloured import colour_left_by, with_coloured_noise
+from visadapt.diagnosis.search.draft import PreparedRecording
 from visadapt.diagnosis.search.fitted_models import MIN_LEFTOVER
 from visadapt.diagnosis.search.jumps import with_jumps
 from visadapt.diagnosis.search.model_comparison import ModelComparison, compare
-from visadapt.diagnosis.search.preparation import PreparedRecording, prepare
+from visadapt.diagnosis.search.preparation import prepare
 from visadapt.diagnosis.search.repeated_causes import repeated_reading_causes
 from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.search.searched_effects import searched

@@ -1,37 +1,129 @@
-"""Commands (T, n) at the stamps (T,), in s, of their rows, each held until the next row: moved in time."""
+"""Commands that are not in the rows in which they act, and where they do."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from statistics import median
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from visadapt.recordings.command_clock import sent_by_clock
+from visadapt.diagnosis.search import sign_conventions
+from visadapt.diagnosis.search.draft import Draft, Readings, with_unmeasured_in_both
+from visadapt.diagnosis.search.search import Search
+from visadapt.diagnosis.words import A_ROW_LATE, OWN_CLOCK, PART_LATE, number
+from visadapt.effects import Effect
+from visadapt.estimation.segments import Segments
+from visadapt.recordings.command_clock import instants, sent_by_clock
+
+EARLIER_LOG_ODDS = 20.0
+"""Log likelihood that commands moved in time must gain: no machine answers before it is asked."""
+
+MIN_PART = 0.02  # Share of a row by which commands must act early to be moved
+
+MOST_BESIDE_LATE = 2
+"""Most effects that are fitted beside the lateness of commands that have stamps of their own, which often are late.
+None are fitted beside that of others, which is rare."""
 
 Move = Callable[[Tensor, Tensor], Tensor]
-"""(commands (T, n), stamps (T,)) to the commands that act in the rows."""
+"""(commands (T, n) of an episode, each held until the next row; stamps (T,) of the rows, in s) to those that act."""
 
 
-def a_row_earlier(command: Tensor, stamps: Tensor) -> Tensor:
+def with_commands_that_act(draft: Draft, catalogue: Sequence[type[Effect]]) -> Draft:
+    """With the commands when they act: by their controller's clock, where that is not the rows'; earlier by a row,
+    where the recording has each beside the readings that it led to; or earlier by part of a row."""
+    given = _Moved.of(draft, catalogue, None)
+    stamped = draft.readings.recording.stamped_commands
+    if not stamped and (period := _controllers_period(draft.readings)) is not None:
+        by_clock = _Moved.of(draft, catalogue, _sent_until_next_row)
+        if sign_conventions.stays_ahead(by_clock.search, given.search, EARLIER_LOG_ODDS):
+            draft = by_clock.told(f"commands change every {number(period)} s, {OWN_CLOCK}")
+            given, stamped = replace(by_clock, draft=draft), True
+    a_row = _Moved.of(draft, catalogue, _a_row_earlier)
+    # Commands that are late by less than a row are, a row earlier, those of a machine with a delay.
+    if not stamped and sign_conventions.stays_ahead(
+        a_row.search, given.search, EARLIER_LOG_ODDS, a_row.search.fit_delays
+    ):
+        return a_row.told(f"each command is recorded a row late, beside the readings that it led to: {A_ROW_LATE}")
+    late = draft.rows.period - a_row.delay(MOST_BESIDE_LATE if stamped else 0)
+    if late > MIN_PART * draft.rows.period:
+        part = _Moved.of(draft, catalogue, partial(_earlier, by=late))
+        if sign_conventions.stays_ahead(part.search, given.search, EARLIER_LOG_ODDS):
+            return part.told(f"the commands act {number(late, 2)} s before the rows that they are in: {PART_LATE}")
+    return replace(draft, source=given.search.source.fits)
+
+
+def _controllers_period(readings: Readings) -> float | None:
+    """The median period, in s, of the controller's clock in each episode; None, if one shows no clock but the rows'."""
+    periods = []
+    for stamps, command in zip(readings.stamps, readings.commands, strict=True):
+        sent = instants(stamps.numpy(), command.numpy())
+        if sent is None:
+            return None
+        periods.append(float(np.median(np.diff(sent))))
+    return median(periods)
+
+
+@dataclass(frozen=True)
+class _Moved:
+    """A draft whose commands are moved in time."""
+
+    draft: Draft
+    move: Move | None
+    rows: Segments
+    raw: Segments
+    search: Search
+
+    @classmethod
+    def of(cls, draft: Draft, catalogue: Sequence[type[Effect]], move: Move | None) -> _Moved:
+        """The draft with its commands moved; without `move`, as they are."""
+        system, rows, raw = draft.readings.system, draft.rows, draft.raw
+        if move is not None:
+            command = rows.command.clone()
+            for episode, stamps in enumerate(draft.readings.stamps):
+                command[episode, : len(stamps)] = move(command[episode, : len(stamps)], stamps)
+            rows, raw = (replace(one, command=command) for one in (rows, raw))
+            rows, raw = with_unmeasured_in_both(rows, raw, system)
+        source = draft.source if move is None else None
+        return cls(draft, move, rows, raw, Search(system, rows.select(draft.searched), catalogue, source))
+
+    def delay(self, beside: int) -> float:
+        """The machine's delay, in s, that fits best, with up to so many other effects `beside` it; a row, where no
+        delay is among the effects searched."""
+        sets = self.search.fit_late_commands()
+        if not sets:
+            return self.rows.period
+        best, before = sets[0], None
+        delay = best.effects[0]
+        while best is not before and len(best.effects) <= beside:
+            before = best
+            grown = self.search.extend([best], sign_conventions.LEADS)
+            best = max((best, *grown), key=lambda one: one.log_odds)
+        return float(best.by_effect(best.fits.theta[0])[delay])
+
+    def told(self, warning: str) -> Draft:
+        """The draft with its commands moved, and a warning of it."""
+        assert self.move is not None
+        readings = self.draft.readings
+        commands = [self.move(each, stamps) for each, stamps in zip(readings.commands, readings.stamps, strict=True)]
+        moved = replace(self.draft, readings=replace(readings, commands=commands))
+        return moved.changed(self.rows, self.raw, warning)
+
+
+def _a_row_earlier(command: Tensor, stamps: Tensor) -> Tensor:
     """The commands, each a row earlier; the last stays."""
     return torch.cat((command[1:], command[-1:]))
 
 
-def earlier(command: Tensor, stamps: Tensor, by: float) -> Tensor:
+def _earlier(command: Tensor, stamps: Tensor, by: float) -> Tensor:
     """The commands, each earlier by so many seconds, up to a row: a row then holds the mean of its own and the next."""
     share = (by / stamps.diff()).clamp(max=1)[:, None]
     return torch.cat((torch.lerp(command[:-1], command[1:], share), command[-1:]))
 
 
-def sent_until_next_row(command: Tensor, stamps: Tensor) -> Tensor:
+def _sent_until_next_row(command: Tensor, stamps: Tensor) -> Tensor:
     """The mean of what a controller sent until the next row, by a clock that is not that of the rows."""
     return torch.from_numpy(sent_by_clock(stamps.numpy(), command.numpy()))
-
-
-def mean_until_next(command: Tensor, stamps: Tensor, rows: Tensor) -> Tensor:
-    """(R, n) of the commands, the mean over time from each of some `rows` (R,) until the next."""
-    held = torch.diff(stamps, append=stamps[-1:])
-    total = torch.cat((torch.zeros_like(command[:1]), (held[:, None] * command).cumsum(0)))
-    means = total[rows].diff(dim=0) / stamps[rows].diff()[:, None]
-    return torch.cat((means, command[rows[-1:]]))

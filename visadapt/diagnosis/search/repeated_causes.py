@@ -13,9 +13,9 @@ from visadapt.diagnosis.result import Cause, Estimate
 from visadapt.diagnosis.search import heldout
 from visadapt.diagnosis.search.angle_defect import BAND
 from visadapt.diagnosis.search.causes import Z_90
+from visadapt.diagnosis.search.draft import PreparedRecording
 from visadapt.diagnosis.search.heldout import RolloutErrors
 from visadapt.diagnosis.search.model_comparison import ModelComparison
-from visadapt.diagnosis.search.preparation import PreparedRecording
 from visadapt.diagnosis.search.search import Search
 from visadapt.effects import Dropout, Effect, FrozenZone
 from visadapt.estimation.candidate import CandidateModel
