@@ -20,6 +20,7 @@ from visadapt.diagnosis.result import (
     UNEXPLAINED,
     Cause,
     Diagnosis,
+    Gap,
     RecordingSummary,
     Region,
     Where,
@@ -145,22 +146,7 @@ def diagnose(
         causes=found,
         ranking=ranking(comparison, explored.effects, system, measured.closed, [one for one, _ in explored.repeats]),
         gap=gap,
-        next_experiment=OF_ONE_MACHINE
-        if verdict == UNEXPLAINED and explored.apart
-        else AS_IT_CHANGES
-        if verdict == UNEXPLAINED and explored.changes
-        else next_step(
-            search,
-            comparison,
-            verdict,
-            groups,
-            found,
-            gap,
-            explored.prepared.coarse,
-            answered.source_leaves,
-            {push.load for push in answered.pushes},
-            answered.no_gap_beside_pushes,
-        ),
+        next_experiment=_next_step(answered, gap),
         warnings=(
             *used.warnings,
             *(f"{effect.name}: {NOT_SEARCHED}" for effect in effects if remembers(effect, system)),
@@ -215,6 +201,27 @@ def _found_before(explored: Explored, film: Film | None) -> list[tuple[Stage, fl
     if film is not None and film.camera.best.camera:
         found.append((Stage.CAMERA, film.camera.lost))
     return found
+
+
+def _next_step(answered: Answer, gap: Gap) -> str:
+    """The experiment to make next, in words."""
+    explored = answered.explored
+    if answered.verdict == UNEXPLAINED and explored.apart:
+        return OF_ONE_MACHINE
+    if answered.verdict == UNEXPLAINED and explored.changes:
+        return AS_IT_CHANGES
+    return next_step(
+        explored.search,
+        explored.comparison,
+        answered.verdict,
+        explored.groups,
+        answered.causes,
+        gap,
+        explored.prepared.coarse,
+        answered.source_leaves,
+        {push.load for push in answered.pushes},
+        answered.no_gap_beside_pushes,
+    )
 
 
 def _warnings(answered: Answer, origin: str) -> Iterator[str]:

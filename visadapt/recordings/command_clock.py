@@ -24,7 +24,7 @@ LATE, MOST_LATE = 1.5, 0.05
 """A controller sends steadily, where of so many intervals between commands this share at most is longer than LATE usual
 ones: one that sends when a command changes does not."""
 
-GAP = 5.0  # Usual intervals without a command from which on rows are left out
+GAP = 5.0  # Usual intervals without a command, or a reading that is interpolated, from which on rows are left out
 
 Floats = NDArray[np.floating]
 

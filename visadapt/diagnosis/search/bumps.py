@@ -95,8 +95,8 @@ def summed(
     time = np.linspace(min(a for a, _ in extents), max(b for _, b in extents), SHAPE_POINTS)
     heights, middles, widths = np.array([(one.height, one.middle, one.width) for one in bumps]).T
     shape = unit * np.exp(-0.5 * ((time[:, None] - middles) / widths) ** 2) @ heights
-    during = time[shape / shape[np.abs(shape).argmax()] >= EDGE_SHARE]
     peak = float(shape[np.abs(shape).argmax()])
+    during = time[shape / peak >= EDGE_SHARE]
     if np.ptp(np.sign(heights)) == 0 and impulse * peak > 0:
         peak *= impulse / sum(one.height * one.area for one in bumps)
     impulse, spread = unit * impulse, Z_90 * unit * math.hypot(deviation, MODEL_ERROR * impulse)

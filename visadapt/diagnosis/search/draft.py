@@ -19,6 +19,7 @@ from visadapt.estimation.repeated_readings import RepeatedReadings
 from visadapt.estimation.segments import Segments, Stretch, cut, smoothly_filled, stretches_without
 from visadapt.estimation.unmeasured_states import with_unmeasured
 from visadapt.recordings import Episode, Recording
+from visadapt.recordings.command_clock import means_until_next
 from visadapt.recordings.runs import runs
 from visadapt.systems import System
 
@@ -103,7 +104,8 @@ class Readings:
             kept = _without_long_runs((used > 0).all(1).numpy())
             read = None if slowest is None else used[:, slowest].nonzero()[:, 0]
             if read is not None and len(read) > 1:
-                time, action, filled = time[read], _mean_until_next(action, time, read), filled[read]
+                means = [means_until_next(time[read].numpy(), time.numpy(), each) for each in action.T.numpy()]
+                time, action, filled = time[read], torch.from_numpy(np.column_stack(means)), filled[read]
                 kept = np.ones(len(read), bool)
             episodes.append(Episode(time.numpy(), action.numpy(), filled.numpy()))
             usable.append(np.repeat(kept[:, None], len(self.channels), 1))
@@ -160,11 +162,3 @@ def _without_long_runs(measured: NDArray[np.bool_]) -> NDArray[np.bool_]:
     for start, end in runs(measured):
         out[start:end] = measured[start] or end - start <= MOST_FILLED
     return out
-
-
-def _mean_until_next(command: Tensor, stamps: Tensor, rows: Tensor) -> Tensor:
-    """(R, n) of the commands, the mean over time from each of some `rows` (R,) until the next."""
-    held = torch.diff(stamps, append=stamps[-1:])
-    total = torch.cat((torch.zeros_like(command[:1]), (held[:, None] * command).cumsum(0)))
-    means = total[rows].diff(dim=0) / stamps[rows].diff()[:, None]
-    return torch.cat((means, command[rows[-1:]]))

@@ -217,10 +217,7 @@ class _Fit:
         problems = []
         for part, track in enumerate(self.tracks):
             design, target = self._whitened(part, self._design(part)), self._whitened(part, track.load)
-            weighted = design
-            if robust:
-                error = self._whitened(part, self.residual[part]).abs()
-                weighted = design * (OUTLIER / error.clamp(min=1e-9)).clamp(max=1)
+            weighted = design * self._huber(part) if robust else design
             normal, gradient = weighted @ design.T, weighted @ target
             problems.append((normal, gradient))
             if several:
@@ -241,6 +238,11 @@ class _Fit:
             self.weights[part] = torch.cholesky_solve(gradient[:, None], self.roots[part])[:, 0]
             explained = torch.einsum("k,knj->nj", self.weights[part], self._design(part))
             self.residual[part] = self.tracks[part].load - explained
+
+    def _huber(self, part: int) -> Tensor:
+        """(N J) weights of a part's errors, of which large ones count less."""
+        error = self._whitened(part, self.residual[part]).abs()
+        return (OUTLIER / error.clamp(min=1e-9)).clamp(max=1)
 
     def _size_errors(self) -> None:
         """How errors grow with activity, and their autoregression (Yule-Walker), joint by joint, where it moves.
@@ -326,7 +328,9 @@ class _Fit:
         deviation: of a load of any shape in their place. Columns that a push makes large, by throwing states far out,
         would explain part of a bump."""
         part, joint = group[0].part, group[0].joint
-        track, others = self.tracks[part], [one for one in self.bumps if one not in group]
+        track, design = self.tracks[part], self._design(part)
+        bumps = [one for one in self.bumps if one.part == part]  # the last rows of the design
+        kept = torch.tensor([True] * (len(design) - len(bumps)) + [one not in group for one in bumps])
         during = torch.zeros(len(track.time), dtype=torch.bool)
         for one in group:
             during |= (track.time - one.middle).abs() <= EDGE * one.width
@@ -334,15 +338,12 @@ class _Fit:
         prior = ANY_SHAPE_PRIOR * max(abs(one.height) for one in group)
         free = torch.zeros(int(during.sum()), *track.load.shape, dtype=torch.float64)
         free[..., joint] = prior * bumps_at(track, track.time[during], step / math.sqrt(2 * math.pi))
-        columns = self._design(part)
-        columns = columns[: len(columns) - sum(one.part == part for one in self.bumps)]
-        kept = [BUMP_PRIOR * one.on(track) for one in others if one.part == part]
-        design = self._whitened(part, torch.cat((columns, free, *(one[None] for one in kept))))
-        weighted = design * (OUTLIER / self._whitened(part, self.residual[part]).abs().clamp(min=1e-9)).clamp(max=1)
+        design = self._whitened(part, torch.cat((design[kept], free)))
+        weighted = design * self._huber(part)
         # Columns have no prior from the other parts, whose pushes the bumps may have left to them.
         root = torch.linalg.cholesky(weighted @ design.T + torch.eye(len(design), dtype=torch.float64))
         weights = torch.cholesky_solve((weighted @ self._whitened(part, track.load))[:, None], root)[:, 0]
-        areas = pad(torch.full((len(free),), prior * step, dtype=torch.float64), (len(columns), len(kept)))
+        areas = pad(torch.full((len(free),), prior * step, dtype=torch.float64), (len(design) - len(free), 0))
         deviation = torch.linalg.solve_triangular(root, areas[:, None], upper=False).square().sum().sqrt()
         return float(areas @ weights), float(deviation)
 
