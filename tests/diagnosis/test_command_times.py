@@ -5,8 +5,9 @@ import pytest
 import torch
 
 from visadapt.diagnosis import diagnose
+from visadapt.diagnosis.next_experiment import EVERY_COMMAND
 from visadapt.diagnosis.search.preparation import prepare
-from visadapt.diagnosis.words import OWN_CLOCK
+from visadapt.diagnosis.words import BETWEEN_ROWS, OWN_CLOCK
 from visadapt.effects import ActuatorDelay, ActuatorGain, ViscousFriction
 from visadapt.recordings import Episode, Recording
 from visadapt.recordings.command_clock import instants
@@ -48,6 +49,16 @@ def test_commands_act_when_a_controller_of_its_own_clock_sent_them(effects):
     assert [said for said in found.warnings if OWN_CLOCK in said] == [f"commands change every 0.0200 s, {OWN_CLOCK}"]
     assert [cause.effect for cause in found.causes] == [effect.name for effect in effects]
     assert found.verdict == ("identified" if effects else "no_gap")
+
+
+@pytest.mark.parametrize("effects", [(), [ViscousFriction(coefficient=2.0)]])
+def test_commands_between_the_rows_are_estimated(effects):
+    recording = recorded(40, lambda step: step % 10 == 0, effects)
+    found = diagnose(recording, World(CartPole()), CATALOGUE)
+    assert BETWEEN_ROWS in found.warnings
+    assert (found.verdict, found.next_experiment) == ("unexplained", EVERY_COMMAND)  # what was sent stays unknown
+    assert [cause.effect for cause in found.partial] == [effect.name for effect in effects]
+    assert all(cause.parameters["coefficient"].value == pytest.approx(2.0, rel=0.15) for cause in found.partial)
 
 
 def test_commands_of_the_loop_that_reads_act_from_their_rows_on():

@@ -50,6 +50,12 @@ AS_IT_CHANGES = (
 )
 """For a recording that is explained by effects whose sizes change within it."""
 
+EVERY_COMMAND = (
+    "Record every command, with the time at which it was sent: the controller is faster than the rows, and what it "
+    "sends between them is not in the recording. A bag of ROS has it, and so has a file with rows as often as commands."
+)
+"""For a recording whose commands change between its rows."""
+
 MIN_LOG_ODDS = 0.0  # Log odds above which the variable of an unexplained disturbance is named: likelier than not
 
 SURE_LOG_ODDS = 4.0  # Log odds above which the disturbance is said to depend on it

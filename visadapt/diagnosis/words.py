@@ -27,6 +27,10 @@ PART_LATE = "they were moved earlier by as much"
 """What it warns of where the commands are late by part of a row."""
 OWN_CLOCK = "by a clock that is not that of the rows: a command is the mean of what was sent until the next row"
 """What it warns of where the controller sends at other times than the rows'."""
+BETWEEN_ROWS = (
+    "commands change between the rows: those that none shows were estimated from the readings, so sizes are not exact"
+)
+"""What it warns of where the controller is faster than the rows."""
 
 OPPOSITE = " has the opposite sign of the source's"
 """What a diagnosis warns of, after the quantity's name, where it inverted a sign of the recording."""

@@ -24,6 +24,7 @@ from visadapt.diagnosis.result import (
 )
 from visadapt.diagnosis.words import (
     BESIDE_PUSHES,
+    BETWEEN_ROWS,
     CHANGES,
     MISFIT,
     ONE_BY_ONE,
@@ -185,6 +186,8 @@ def _unexplained(diagnosis: Diagnosis) -> str:
     best = gap.closed
     black_box = (gap.before - gap.black_box) / (gap.before - gap.floor) if gap.before != gap.floor else math.nan
     text, most = "Something acts that no known effect explains: ", "the most probable of them"
+    if BETWEEN_ROWS in diagnosis.warnings:
+        text, most = "The recording lacks commands that were sent between its rows: ", "the most probable effects"
     if best <= 0:
         text += f"{most} close none of the gap"
     elif black_box > best:

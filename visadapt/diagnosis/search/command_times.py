@@ -14,7 +14,7 @@ from torch import Tensor
 from visadapt.diagnosis.search import sign_conventions
 from visadapt.diagnosis.search.draft import Draft, Readings, with_unmeasured_in_both
 from visadapt.diagnosis.search.search import Search
-from visadapt.diagnosis.words import A_ROW_LATE, OWN_CLOCK, PART_LATE, number
+from visadapt.diagnosis.words import A_ROW_LATE, BETWEEN_ROWS, OWN_CLOCK, PART_LATE, number
 from visadapt.effects import Effect
 from visadapt.estimation.segments import Segments
 from visadapt.recordings.command_clock import instants, sent_by_clock
@@ -28,13 +28,19 @@ MOST_BESIDE_LATE = 2
 """Most effects that are fitted beside the lateness of commands that have stamps of their own, which often are late.
 None are fitted beside that of others, which is rare."""
 
-Move = Callable[[Tensor, Tensor], Tensor]
-"""(commands (T, n) of an episode, each held until the next row; stamps (T,) of the rows, in s) to those that act."""
+PARTS = (0.2, 0.1, 0.35, 0.5)
+"""Parts of a row for which a controller that is faster than the rows may hold each command. The others are tried only
+where the first alone is likelier than commands that are held for a row."""
+
+Move = Callable[[Tensor, Tensor, Tensor], Tensor]
+"""(commands (T, n) of an episode, each held until the next row; stamps (T,) of the rows, in s; readings (T, m)) to the
+commands that act."""
 
 
 def with_commands_that_act(draft: Draft, catalogue: Sequence[type[Effect]]) -> Draft:
-    """With the commands when they act: by their controller's clock, where that is not the rows'; earlier by a row,
-    where the recording has each beside the readings that it led to; or earlier by part of a row."""
+    """With the commands when they act: by their controller's clock, where that is slower than the rows; earlier by a
+    row, where the recording has each beside the readings that it led to; earlier by part of a row; or, where the
+    controller is faster than the rows, with an estimate of what it sent between them."""
     given = _Moved.of(draft, catalogue, None)
     stamped = draft.readings.recording.stamped_commands
     if not stamped and (period := _controllers_period(draft.readings)) is not None:
@@ -49,11 +55,30 @@ def with_commands_that_act(draft: Draft, catalogue: Sequence[type[Effect]]) -> D
     ):
         return a_row.told(f"each command is recorded a row late, beside the readings that it led to: {A_ROW_LATE}")
     late = draft.rows.period - a_row.delay(MOST_BESIDE_LATE if stamped else 0)
+    part = given
     if late > MIN_PART * draft.rows.period:
-        part = _Moved.of(draft, catalogue, partial(_earlier, by=late))
-        if sign_conventions.stays_ahead(part.search, given.search, EARLIER_LOG_ODDS):
-            return part.told(f"the commands act {number(late, 2)} s before the rows that they are in: {PART_LATE}")
+        earlier = _Moved.of(draft, catalogue, partial(_earlier, by=late))
+        if sign_conventions.stays_ahead(earlier.search, given.search, EARLIER_LOG_ODDS):
+            part = earlier
+    if not stamped and (faster := _faster_than_rows(draft, catalogue, part)) is not None:
+        return faster
+    if part is not given:
+        return part.told(f"the commands act {number(late, 2)} s before the rows that they are in: {PART_LATE}")
     return replace(draft, source=given.search.source.fits)
+
+
+def _faster_than_rows(draft: Draft, catalogue: Sequence[type[Effect]], slower: _Moved) -> Draft | None:
+    """With an estimate of what the controller sent between the rows, if that is likelier than `slower` commands."""
+    if not all(bool(values.isfinite().all()) for values in draft.readings.states):
+        return None
+    first, *others = (partial(_between_rows, part=part) for part in PARTS)
+    best = _Moved.of(draft, catalogue, first)
+    if best.source_likelihood < slower.source_likelihood + EARLIER_LOG_ODDS:
+        return None
+    best = max((best, *(_Moved.of(draft, catalogue, each) for each in others)), key=lambda one: one.source_likelihood)
+    if not sign_conventions.stays_ahead(best.search, slower.search, EARLIER_LOG_ODDS):
+        return None
+    return best.told(BETWEEN_ROWS)
 
 
 def _controllers_period(readings: Readings) -> float | None:
@@ -83,12 +108,17 @@ class _Moved:
         system, rows, raw = draft.readings.system, draft.rows, draft.raw
         if move is not None:
             command = rows.command.clone()
-            for episode, stamps in enumerate(draft.readings.stamps):
-                command[episode, : len(stamps)] = move(command[episode, : len(stamps)], stamps)
+            for episode, (stamps, states) in enumerate(zip(draft.readings.stamps, draft.readings.states, strict=True)):
+                command[episode, : len(stamps)] = move(command[episode, : len(stamps)], stamps, states)
             rows, raw = (replace(one, command=command) for one in (rows, raw))
             rows, raw = with_unmeasured_in_both(rows, raw, system)
         source = draft.source if move is None else None
         return cls(draft, move, rows, raw, Search(system, rows.select(draft.searched), catalogue, source))
+
+    @property
+    def source_likelihood(self) -> float:
+        """Log likelihood of the source's fit."""
+        return float(self.search.source.fits.likelihood[0])
 
     def delay(self, beside: int) -> float:
         """The machine's delay, in s, that fits best, with up to so many other effects `beside` it; a row, where no
@@ -108,22 +138,37 @@ class _Moved:
         """The draft with its commands moved, and a warning of it."""
         assert self.move is not None
         readings = self.draft.readings
-        commands = [self.move(each, stamps) for each, stamps in zip(readings.commands, readings.stamps, strict=True)]
+        episodes = zip(readings.commands, readings.stamps, readings.states, strict=True)
+        commands = [self.move(command, stamps, states) for command, stamps, states in episodes]
         moved = replace(self.draft, readings=replace(readings, commands=commands))
         return moved.changed(self.rows, self.raw, warning)
 
 
-def _a_row_earlier(command: Tensor, stamps: Tensor) -> Tensor:
+def _a_row_earlier(command: Tensor, stamps: Tensor, states: Tensor) -> Tensor:
     """The commands, each a row earlier; the last stays."""
     return torch.cat((command[1:], command[-1:]))
 
 
-def _earlier(command: Tensor, stamps: Tensor, by: float) -> Tensor:
+def _earlier(command: Tensor, stamps: Tensor, states: Tensor, by: float) -> Tensor:
     """The commands, each earlier by so many seconds, up to a row: a row then holds the mean of its own and the next."""
     share = (by / stamps.diff()).clamp(max=1)[:, None]
     return torch.cat((torch.lerp(command[:-1], command[1:], share), command[-1:]))
 
 
-def _sent_until_next_row(command: Tensor, stamps: Tensor) -> Tensor:
+def _sent_until_next_row(command: Tensor, stamps: Tensor, states: Tensor) -> Tensor:
     """The mean of what a controller sent until the next row, by a clock that is not that of the rows."""
     return torch.from_numpy(sent_by_clock(stamps.numpy(), command.numpy()))
+
+
+def _between_rows(command: Tensor, stamps: Tensor, states: Tensor, part: float) -> Tensor:
+    """The mean, over each row, of what a controller sends that holds a command for this part of it.
+
+    What it makes of the readings goes on as in the rows, on average to half way to the last command that it sends
+    within the row. What else is in a row's command acts for that part alone: the next command may have another.
+    """
+    around = torch.cat((states[:1], states, states[-1:])).unfold(0, 3, 1).flatten(1)  # (T, 3 m), for the rates too
+    around = (around - around.mean(0)) / around.std(0).clamp(min=1e-300)
+    known = torch.cat((torch.ones_like(around[:, :1]), around), 1)
+    of_readings = known @ torch.linalg.lstsq(known, command).solution
+    half_way = 0.5 * (1 - part) * float(stamps.diff().median())
+    return _earlier(of_readings, stamps, states, half_way) + part * (command - of_readings)

@@ -66,7 +66,7 @@ def stays_ahead(
     """Whether a recording read in another way is likelier than as it is given, by the log likelihood that is required:
     under the source and, if it is, when effects are added to the source in both, and to sets `beside` it in the
     other."""
-    if _ahead(other, as_given) <= required:
+    if float(other.source.fits.likelihood[0] - as_given.source.fits.likelihood[0]) <= required:
         return False
     if not other.catalogue:
         return True
