@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
@@ -32,13 +30,22 @@ class MLPRenderer(nn.Module):
             first.bias.mul_(max(self.input_gain))
 
     @torch.no_grad()
-    def start_from(self, frames: Tensor) -> None:
+    def start_from(self, x: Tensor, frames: Tensor) -> None:
         """Initialise the last layer's bias with the mean of frames (N, H, W) uint8."""
         self.last.bias.copy_((frames.float().mean(0) / 255).flatten())
 
     def forward(self, x: Tensor, theta: Tensor) -> Tensor:
         """Frames (B, H, W) of cart positions (B,) in m and pole angles (B,) in rad."""
         return self.last(self.layers(torch.stack((x, theta.sin(), theta.cos()), -1))).unflatten(-1, self.size)
+
+
+ALONG_TRACK = 15  # Positions of the cart, evenly spaced, from whose frames the background is taken
+
+FAINTEST = 20.0  # Grey levels of 255 up to which a difference from the background is none
+
+NEAREST = 0.1
+"""Least distance of the plane of motion from the camera, over that at the hinge: what is farther to the side is behind
+the camera."""
 
 
 class Layer(nn.Module):
@@ -95,9 +102,10 @@ class Layer(nn.Module):
 class LayeredRenderer(nn.Module):
     """Ours: a learnt background and two learnt pictures, cart and pole, moved by a learnt camera.
 
-    The model assumes only that a rigid cart slides and a rigid pole turns about a hinge on it; their appearance, the
-    hinge's place in the frame and the pixels per metre are learnt from frames. Since pictures are moved and never
-    interpolated between states, frames are sharp at every state.
+    The model assumes only that a rigid cart slides and a rigid pole turns about a hinge on it, in one plane; their
+    appearance, the hinge's place in the frame, the pixels per metre, the side from which the camera looks at the plane
+    and its lens's distortion are learnt from frames. Since pictures are moved and never interpolated between states,
+    frames are sharp at every state.
     """
 
     guess: Tensor
@@ -122,6 +130,8 @@ class LayeredRenderer(nn.Module):
         self.origin = nn.Parameter(torch.tensor([float(column), float(row)]))
         self.gain = nn.Parameter(torch.tensor([float(scale), 0.0]))
         self.tilt = nn.Parameter(torch.zeros(()))
+        self.stretch, self.perspective = nn.Parameter(torch.zeros(2)), nn.Parameter(torch.zeros(2))
+        self.distortion = nn.Parameter(torch.zeros(()))
         across = 0.15 * length + 2
         self.cart = Layer((-0.35 * length, 0.35 * length, -0.2 * length, 0.35 * length), False, detail)
         self.pole = Layer((-across, across, -length, 0.2 * length), True, detail)
@@ -133,31 +143,60 @@ class LayeredRenderer(nn.Module):
         return max(column, self.size[1] - 1 - column) / max(1e-9, abs(float(self.gain[0].detach())))
 
     @torch.no_grad()
-    def start_from(self, frames: Tensor) -> None:
-        """Initialise the background with the median of frames (N, H, W) uint8, which shows what does not move."""
-        self.background.copy_((frames.median(0).values / 255).clamp(0.01, 0.99).logit())
+    def start_from(self, x: Tensor, frames: Tensor) -> None:
+        """Initialise the background, and how far down the cart goes a metre, from frames (N, H, W) uint8 at positions x
+        (N,) in m. In training, pictures that were learnt at other heights would hold the cart to these."""
+        evenly = torch.linspace(float(x.min()), float(x.max()), ALONG_TRACK, dtype=x.dtype)
+        still = frames[(x - evenly[:, None]).abs().argmin(1)].median(0).values  # shows what does not move
+        self.background.copy_((still / 255).clamp(0.01, 0.99).logit())
+        first = int(self.guess[1].clamp(0, self.size[0] - 1))  # above it there is the pole, which turns
+        cart = (frames[:, first:].float() - still[first:].float()).abs()
+        cart = (cart - FAINTEST).clamp(min=0).sum(2)
+        seen = cart.sum(1) > 0
+        if int(seen.sum()) > 2:
+            row = (cart @ torch.arange(cart.shape[1], dtype=cart.dtype))[seen] / cart[seen].sum(1)
+            off = x[seen] - x[seen].mean()
+            self.gain[1] = (off @ row) / off.square().sum().clamp(min=1e-12)
 
     def forward(self, x: Tensor, theta: Tensor) -> Tensor:
         """Frames (B, H, W) of cart positions (B,) in m and pole angles (B,) in rad."""
-        width = self.size[1]
-        columns = torch.arange(width, device=x.device, dtype=x.dtype)
         hinge = self.origin + self.gain * x[:, None]
         frame = self.background.sigmoid().expand(len(x), -1, -1)
         moved = self.origin - self.guess
+        pixels = self._seen_squarely(x)
         for layer in (self.cart, self.pole):
-            first, last = self._rows(layer, hinge, moved)
-            rows = torch.arange(first, last, device=x.device, dtype=x.dtype)
-            grid = torch.meshgrid(columns, rows, indexing="xy")
-            pixels = torch.stack((*grid, torch.ones_like(grid[0])), -1)
-            shade, opacity = layer(pixels, hinge, theta + self.tilt, moved).unbind(1)
+            first, last = self._rows(layer, hinge, moved, pixels[..., 1])
+            shade, opacity = layer(pixels[first:last], hinge, theta + self.tilt, moved).unbind(1)
             band = frame[:, first:last] * (1 - opacity) + shade
             frame = torch.cat((frame[:, :first], band, frame[:, last:]), 1)
         return frame
 
-    def _rows(self, layer: Layer, hinge: Tensor, moved: Tensor) -> tuple[int, int]:
-        """The first row that a layer can cover and the one after the last; the others need not be computed."""
+    def _seen_squarely(self, like: Tensor) -> Tensor:
+        """(H, W, 3) where each pixel would be in the frame of a camera without distortion that is square to the plane
+        of motion: (column, row, 1).
+
+        A lens moves what it shows from the middle of the frame by a share that grows with the square of the distance
+        (Brown 1971). A plane seen at an angle is a homography of the plane seen squarely: 4 numbers, beside the hinge's
+        place, the scale and the tilt, which are other parameters (Hartley and Zisserman 2004, section 2.4).
+        """
+        height, width = self.size
+        columns, rows = (torch.arange(n, device=like.device, dtype=like.dtype) for n in (width, height))
+        pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1)
+        middle = 0.5 * torch.stack((columns[-1], rows[-1]))
+        off = pixels - middle
+        off = off * (1 + self.distortion * (2 * off / width).square().sum(-1, keepdim=True))
+        off = off + middle - self.guess
+        nearer = 1 + (off * self.perspective / width).sum(-1, keepdim=True)
+        wider = (off * self.stretch).sum(-1, keepdim=True)
+        square = torch.cat((off[..., :1] + wider, off[..., 1:]), -1) / nearer.clamp(min=NEAREST) + self.guess
+        return torch.cat((square, torch.ones_like(wider)), -1)
+
+    def _rows(self, layer: Layer, hinge: Tensor, moved: Tensor, rows: Tensor) -> tuple[int, int]:
+        """The first row that a layer can cover and the one after the last; the others need not be computed. `rows` (H,
+        W) are those of the pixels, seen squarely."""
         # Where a simulation has diverged (nan, infinite or huge positions), it does not matter where the cart is drawn.
         row = hinge.detach()[:, 1].nan_to_num().clamp(-1e6, 1e6)
         radius = layer.radius + float(moved.detach().norm())
-        first = max(0, math.floor(float(row.min()) - radius))
-        return first, max(first, min(self.size[0], math.ceil(float(row.max()) + radius) + 1))
+        covered = (rows.detach() > row.min() - radius - 1) & (rows.detach() < row.max() + radius + 1)
+        numbers = covered.any(1).nonzero()
+        return (int(numbers[0]), int(numbers[-1]) + 1) if len(numbers) else (0, 0)

@@ -47,11 +47,13 @@ def fit(
     """
     if steps < 3:
         raise ValueError(f"steps is {steps}, must be at least 3")
-    renderer.start_from(frames)
+    renderer.start_from(x, frames)
     if isinstance(renderer, LayeredRenderer):
-        camera = ("origin", "gain", "tilt")
+        camera = ("origin", "gain", "tilt", "stretch", "perspective", "distortion")
         pictures = [parameter for name, parameter in renderer.named_parameters() if name not in camera]
-        groups = [{"params": pictures}, {"params": [renderer.origin, renderer.gain]}, {"params": [renderer.tilt]}]
+        places = [renderer.origin, renderer.gain]
+        view = [renderer.tilt, renderer.stretch, renderer.perspective, renderer.distortion]
+        groups = [{"params": pictures}, {"params": places}, {"params": view}]
         rates = [0.1, 0.05, 0.003]
     else:
         groups, rates = [{"params": list(renderer.parameters())}], [4e-3]

@@ -18,7 +18,8 @@ from visadapt.cli.errors import InputError
 from visadapt.cli.progress import progress
 from visadapt.cli.run_folders import run_settings, unfinished
 from visadapt.cli.target import load_target
-from visadapt.estimation.frame_residuals import size_of, structure
+from visadapt.estimation.frame_residuals import evenly_spaced, size_of, structure
+from visadapt.estimation.poses import PoseFinder, reach_of
 from visadapt.progress import staged
 from visadapt.recordings import Episode
 from visadapt.recordings.checks import LEAST_ROWS, check_units
@@ -41,6 +42,8 @@ FAINT = 20 / 255
 
 NOT_LEARNT = 0.4
 """Error where cart and pole are, over how far they stand out, above which they are not where they are drawn."""
+
+MOST_READ = 100  # Frames from which the pose is read
 
 DRAWN_AT_ONCE = 64  # Frames, which bounds the memory that drawing takes
 
@@ -78,9 +81,10 @@ def run(options: argparse.Namespace) -> None:
         contrast = torch.maximum((seen - background).abs(), (drawn - background).abs())
         moves = contrast > FAINT
         error, stands_out = (255 * float(each[moves].abs().mean()) for each in (residual, contrast))
+        own = size_of(structure(residual))  # without noise
         if is_learnt := error <= NOT_LEARNT * stands_out:
             with replacing(out) as temporary:
-                save_renderer(temporary, renderer, {**settings, "error": size_of(structure(residual))})
+                save_renderer(temporary, renderer, {**settings, "error": own})
     if not is_learnt:  # The training is of no use, and a better guess makes another one
         raise InputError(
             f"the renderer has not learnt to draw these frames: where cart and pole are, it is {error:.0f} grey levels "
@@ -90,9 +94,20 @@ def run(options: argparse.Namespace) -> None:
         )
     column, row = renderer.origin.tolist()
     print(
-        f"{out}: {error:.2f} grey levels of 255 off where cart and pole are, on average, in {len(drawn)} frames left "
-        f"out of the training; hinge at {column:.1f},{row:.1f} px, {renderer.gain[0]:.1f} px a metre"
+        f"{out}: in {len(drawn)} frames left out of the training, {error:.2f} grey levels of 255 off where cart and pole "
+        f"are, on average; {_read_from(renderer, x[held_out], theta[held_out], frames[held_out])}; hinge at "
+        f"{column:.1f},{row:.1f} px, {renderer.gain[0]:.1f} px a metre"
     )
+
+
+def _read_from(renderer: LayeredRenderer, x: Tensor, theta: Tensor, frames: Tensor) -> str:
+    """How well the pose is read from frames (N, H, W) of known x (N,) and theta (N,), in words."""
+    few = evenly_spaced(len(frames), MOST_READ)
+    poses = PoseFinder(renderer, reach_of(renderer, CartPole()))(frames[few])
+    if not poses.explained.any():
+        return "no pose is read from them"
+    off = (poses.pose - torch.stack((x, theta), -1)[few])[poses.explained].abs().median(0).values
+    return f"x is read {off[0]:.2g} m off, theta {off[1]:.2g} rad (median)"
 
 
 def _check(options: argparse.Namespace, x: Tensor, frames: Tensor) -> None:

@@ -62,10 +62,10 @@ are off by 0.14 mm and 0.23 mrad (root mean square), with scales off by up to 0.
 UNSEEN = (Dropout, FrozenZone, MeasurementDelay, PositionDelay, AngleDelay)
 """Faults of separate sensors, which a camera cannot have: one frame shows cart and pole at the same instant."""
 
-MIN_MOTION_ERROR, MIN_MOTION_ERROR_MOVED = 1.0, 2.0
+MIN_MOTION_ERROR, MIN_MOTION_ERROR_MOVED = 1.1, 2.0
 """Error of the source's predictions, over the noise of positions, from which motion shows a gap, and the same where the
-camera was moved. Below, it may be the renderer's own error, which is no noise, and is larger where frames are
-interpolated: a milliradian of the angle, which would pass for an offset."""
+camera was moved. Below, it may be the renderer's own error, which is no noise: half a milliradian of the angle, which
+would pass for an offset, where a renderer was trained on 600 noisy frames; more where frames are interpolated."""
 
 VAGUE = 3.0  # Standard deviation of a pose, over the median, above which a frame does not show it
 
