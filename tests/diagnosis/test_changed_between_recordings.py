@@ -35,6 +35,18 @@ def test_what_explains_each_is_said():
     assert str(found).startswith("unexplained: Each recording is explained by itself, but not all together")
 
 
+def test_the_unchanged_simulator_may_explain_one_of_them():
+    days = [record(effects, 2, seed=k) for k, effects in enumerate(((), [ViscousFriction(coefficient=3.0)]))]
+    both = dataclasses.replace(
+        days[0],
+        episodes=tuple(episode for day in days for episode in day.episodes),
+        sources=("monday", "monday", "friday", "friday"),
+    )
+    found = diagnose(both, World(CartPole()), CATALOGUE)
+    (said,) = (warning for warning in found.warnings if warning.startswith(ONE_BY_ONE))
+    assert said.startswith(f"{ONE_BY_ONE}: monday by the unchanged simulator; friday by viscous friction")
+
+
 def test_of_a_machine_that_was_left_as_it_is_nothing_is_said():
     found = diagnose(of_two_days(), World(CartPole()), CATALOGUE)
     assert found.verdict == "identified"

@@ -7,8 +7,8 @@ import pytest
 
 from tests.diagnosed import record
 from visadapt.diagnosis import diagnose
-from visadapt.diagnosis.next_experiment import AS_IT_CHANGES
-from visadapt.diagnosis.words import CHANGES
+from visadapt.diagnosis.next_experiment import AS_IT_CHANGES, OF_ONE_MACHINE
+from visadapt.diagnosis.words import CHANGES, CHANGES_BETWEEN
 from visadapt.effects import ActuatorGain, CoulombFriction, PoleLength, ViscousFriction
 from visadapt.effects.forces import CartForce
 from visadapt.recordings import Recording
@@ -59,6 +59,29 @@ class Ridges(CartForce):
 
 
 Ridges.name = "ridges"  # only now, so that it is in no catalogue
+
+
+class Faint(Ridges):
+    """A twelfth of it."""
+
+    def push(self, time, state, system):
+        return super().push(time, state, system) / 12
+
+
+Faint.name = "faint"
+
+
+def test_sizes_that_change_from_file_to_file_are_said_for_each():
+    """Beside what no effect describes, so that none is explained by itself."""
+    cold, warm = ([ViscousFriction(coefficient=size), Faint()] for size in (4.0, 1.5))
+    both = dataclasses.replace(one_after_the_other([cold] * 3 + [warm] * 3), sources=("cold",) * 3 + ("warm",) * 3)
+    found = diagnose(both, World(CartPole()), CATALOGUE)
+    assert (found.verdict, found.next_experiment) == ("unexplained", OF_ONE_MACHINE)
+    (said,) = (warning for warning in found.warnings if warning.startswith(CHANGES_BETWEEN))
+    assert "cold and warm, in this order" in said
+    sizes = said.partition("viscous friction (coefficient ")[2].partition(" N")[0].split(", ")
+    np.testing.assert_allclose([float(size) for size in sizes], [4.0, 1.5], rtol=0.1)
+    assert str(found).startswith("unexplained: The size of an effect changes from one recording to the next")
 
 
 @pytest.mark.parametrize("effects", [(), [ViscousFriction(coefficient=2.0)], [Ridges()]])

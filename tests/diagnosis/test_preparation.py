@@ -80,7 +80,7 @@ def test_velocities_that_a_rig_derives_are_left_out():
         with_filtered_velocities(dataclasses.replace(jittered(True), episodes=WHOLE_POSITIONS)), CartPole()
     )
     assert prepared.rows.channels == (0, 2)
-    assert sum("derived on the rig, not measured; left out" in warning for warning in prepared.warnings) == 2
+    assert sum("derived from it on the rig, or filtered; left out" in warning for warning in prepared.warnings) == 2
 
 
 def test_noise_of_few_readings_does_not_make_velocities_late():

@@ -229,7 +229,8 @@ class TestCommands:
         table = a_table()
         table["command"] = 1.1 * table["command"]
         (warning,) = load(write(file, table)).warnings
-        assert "of command lie outside, up to" in warning
+        assert "of command lie outside, " in warning
+        assert "the farthest; within [-1, 1] is right" in warning
 
     def test_never_changing(self, file):
         table = a_table()

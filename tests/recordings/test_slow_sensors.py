@@ -80,6 +80,21 @@ def test_rows_that_are_lost_at_random_are_no_slow_sensor(file, run, share):
     assert not load(write(file, {**run, **lost}), columns=POSITIONS_ALONE).usable
 
 
+def test_a_position_that_grows_steadily_is_held_as_the_other_is(file, run):
+    """As the fixes of an aircraft in steady flight, whose steps are all alike, as an encoder's."""
+    x = 0.5 + 1e-3 * np.arange(ROWS)
+    fixes = {"x": held(x, EVERY_4), "theta": held(run["theta"], EVERY_4)}
+    recording = load(write(file, {**run, **fixes}), columns=POSITIONS_ALONE)
+    np.testing.assert_array_equal(usable(recording, "x"), EVERY_4)
+    np.testing.assert_array_equal(usable(recording, "theta"), EVERY_4)
+
+
+def test_where_a_motion_turns_round_an_encoder_reads_the_same_twice(file, run):
+    x = np.round(0.3 * np.sin(2 * np.pi * (np.arange(ROWS) + 0.5) / 40) / 1e-4) * 1e-4
+    assert (np.diff(x) == 0).sum() > 15
+    assert not load(write(file, {**run, "x": x}), columns=POSITIONS_ALONE).usable
+
+
 def of_a_cart_that_rests(step):
     return np.round(0.3 * np.sin(3 * np.minimum(0.02 * np.arange(ROWS), 6)) / step) * step
 

@@ -34,8 +34,9 @@ def from_aside(frames):
     u, v = (each * (1 + 0.2 * (u**2 + v**2)) for each in (u, v))
     nearer = 1 + 0.3 * u - 0.15 * v
     column, row = width * (u / nearer) + width / 2, width * ((v + 0.05 * u) / nearer) + height / 2
-    place = [each.astype(np.float32) for each in (column, row)]
-    return np.stack([cv2.remap(one, *place, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for one in frames])
+    columns, rows = column.astype(np.float32), row.astype(np.float32)
+    seen = [cv2.remap(one, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for one in frames]
+    return np.stack(seen)
 
 
 def made(kind):

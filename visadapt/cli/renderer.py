@@ -93,10 +93,10 @@ def run(options: argparse.Namespace) -> None:
             "camera? Or are --iterations too few?"
         )
     column, row = renderer.origin.tolist()
+    read = _read_from(renderer, x[held_out], theta[held_out], frames[held_out])
     print(
-        f"{out}: in {len(drawn)} frames left out of the training, {error:.2f} grey levels of 255 off where cart and pole "
-        f"are, on average; {_read_from(renderer, x[held_out], theta[held_out], frames[held_out])}; hinge at "
-        f"{column:.1f},{row:.1f} px, {renderer.gain[0]:.1f} px a metre"
+        f"{out}: in {len(drawn)} frames left out of the training, {error:.2f} grey levels of 255 off where cart and "
+        f"pole are, on average; {read}; hinge at {column:.1f},{row:.1f} px, {renderer.gain[0]:.1f} px a metre"
     )
 
 

@@ -16,6 +16,7 @@ from visadapt.diagnosis.figures_data import disturbances, figure_data, film_fram
 from visadapt.diagnosis.frames import UNSEEN, Film, FramesError, watch, with_camera
 from visadapt.diagnosis.next_experiment import AS_IT_CHANGES, EVERY_COMMAND, OF_ONE_MACHINE
 from visadapt.diagnosis.result import (
+    AMBIGUOUS,
     NO_GAP,
     UNEXPLAINED,
     Cause,
@@ -43,6 +44,7 @@ from visadapt.diagnosis.verdict import (
     left_unexplained,
     next_step,
     of_many,
+    of_one_explanation,
     one_by_one,
     shown_by_episodes,
 )
@@ -151,6 +153,7 @@ def diagnose(
             *used.warnings,
             *(f"{effect.name}: {NOT_SEARCHED}" for effect in effects if remembers(effect, system)),
             *_warnings(answered, recording.sources[0]),
+            *(of_one_explanation(comparison) if policy is not None and verdict == AMBIGUOUS else ()),
         ),
         figures=replace(
             figure_data(search, measured, before, after, regions),
@@ -209,7 +212,7 @@ def _next_step(answered: Answer, gap: Gap) -> str:
     if answered.verdict == UNEXPLAINED and explored.apart:
         return OF_ONE_MACHINE
     if answered.verdict == UNEXPLAINED and explored.changes:
-        return AS_IT_CHANGES
+        return OF_ONE_MACHINE if explored.changes[0].files else AS_IT_CHANGES
     if answered.verdict == UNEXPLAINED and BETWEEN_ROWS in explored.prepared.warnings:
         return EVERY_COMMAND
     return next_step(

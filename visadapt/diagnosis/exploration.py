@@ -78,7 +78,7 @@ def explore(
     changes: tuple[Changing, ...] = ()
     if comparison.leftover > MIN_LEFTOVER and not comparison.negligible and jumping is None:
         apart = explained_apart(searched_in, candidates, recording.sources, progress)
-        changes = () if apart else changing(searched_in)
+        changes = () if apart else changing(searched_in, recording.sources)
     if not apart and not changes:
         again = staged(progress, "search with coloured noise")
         search, comparison = with_coloured_noise(search, comparison, prepared.searched, again)

@@ -2,9 +2,9 @@
 
 An ambiguous diagnosis names effects that fit a recording equally well. Each explanation is simulated under every
 excitation of a family (square waves, sines, pseudo-random binary sequences, white noise; the largest that keeps all
-states within 0.9 of the system's ranges), and every explanation is fitted to what each shows. The worth of an
-excitation is the log posterior odds of the true against the other explanation: the least over all pairs of the first
-explanation and another, with either of them true. This is the expected information of Box and Hill (1967),
+states within 0.9 of the system's ranges, about their middles), and every explanation is fitted to what each shows. The
+worth of an excitation is the log posterior odds of the true against the other explanation: the least over all pairs of
+the first explanation and another, with either of them true. This is the expected information of Box and Hill (1967),
 Technometrics 9(1), with fits in place of a linear model and the worst case in place of the mean.
 
 The odds are those of readings without noise under the recording's noise, which is what they are on average: drawn noise
@@ -28,6 +28,7 @@ from visadapt.diagnosis.policy_bound import StatesToActions, actions
 from visadapt.diagnosis.result import AMBIGUOUS, Diagnosis, Push, named_effects
 from visadapt.diagnosis.search.fitted_models import FittedModels
 from visadapt.diagnosis.search.preparation import limited, prepare
+from visadapt.diagnosis.words import number, with_unit
 from visadapt.effects import EFFECTS, Effect
 from visadapt.estimation.fit_states import CAREFUL, QUICK, with_effect
 from visadapt.estimation.likelihood import FitState
@@ -43,7 +44,7 @@ CYCLES = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)  # In a prediction time, of square wave
 BIT_ROWS = (1, 2, 4, 8)  # Rows of a bit of a pseudo-random binary sequence
 SIZES = (0.05, 0.1, 0.14, 0.2, 0.28, 0.4, 0.57, 0.8)
 """Amplitudes that are tried, and the standard deviation of white noise, as shares of half the command's range."""
-MARGIN = 0.9  # Share of the states' ranges that an experiment may reach
+MARGIN = 0.9  # Share of the states' ranges, about their middles, that an experiment may reach
 SUBSTEP = 0.025  # Longest integration step of a simulation, in prediction times
 WORTH = 3.0  # Log odds up to which an experiment is said to settle nothing
 CERTAIN = 100.0  # Log odds above which more make no difference
@@ -113,7 +114,8 @@ def plan(
         found: the diagnosis of `recording`.
         recording: of states; the experiment starts in its first state.
         source: the world that was diagnosed, without effects.
-        policy: gives the commands to which the excitation is added; without one these are zero.
+        policy: gives the commands to which the excitation is added. Without one these are zero or, where that is no
+            command within the range but its end, the mean of those recorded, which the plan's `added` then holds too.
         samples: length of the experiment, in commands.
         seed: of all noise drawn.
         progress: called with (excitations tried, excitations in all, best log odds so far).
@@ -145,7 +147,7 @@ def plan(
     white = [k for k, name in enumerate(trials.names) if name.startswith("white")]
     return Plan(
         explanations=tuple(tuple(effect.name for effect in each) for each in sets),
-        excitation=f"{trials.names[best]} ({SIZES[int(trials.largest[best])]:g} of half the range)",
+        excitation=f"{trials.names[best]} ({SIZES[int(trials.largest[best])]:g} of half the range{trials.about})",
         time=recording.period * np.arange(samples),
         added=trials.added[trials.row(best)].numpy(),
         actions=tuple(action.name for action in source.system.actions),
@@ -164,6 +166,7 @@ class _Trials:
     noise: Tensor  # (n,) standard deviation of the readings of each state
     names: list[str]  # of the E excitations, in words
     added: Tensor  # (sizes times E, T, n_action) to the commands
+    about: str  # the constant commands that `added` holds, in words
     shown: list[tuple[Tensor, Tensor]]  # of each explanation the readings and the commands, a row for each of `added`
     largest: Tensor  # (E,) the largest admissible of the SIZES of each excitation, by index; -1 without any
 
@@ -186,14 +189,21 @@ class _Trials:
         noise, start, measured = _noise_and_start(sets[0], recording, system, pushes)
         names, unit = _excitations(system, recording.period, samples, generator)
         sizes = torch.tensor(SIZES, dtype=unit.dtype)[:, None, None, None]
-        added = (sizes * unit).flatten(0, 1)
+        constant = _operating_point(recording, system) if policy is None else torch.zeros_like(unit[0, 0])
+        added = (constant + sizes * unit).flatten(0, 1)
+        added = system.within_range(added) if policy is None else added
+        about = "".join(
+            f", about {action.name} {with_unit(number(value), action.unit)}"
+            for action, value in zip(system.actions, constant.tolist(), strict=True)
+            if value
+        )
         runs = [_simulate(each, system, recording, added, policy, noise, start, generator) for each in sets]
         admissible = torch.stack([inside for _, inside in runs]).all(0).unflatten(0, (len(SIZES), len(names)))
         largest = admissible.long().cumprod(0).sum(0) - 1
         if bool((largest < 0).all()):
             hint = "" if policy else ": give the policy of the rig"
             raise ValueError(f"the machine leaves the ranges of its states under every excitation{hint}")
-        return cls(recording, system, measured, noise, names, added, [shown for shown, _ in runs], largest)
+        return cls(recording, system, measured, noise, names, added, about, [shown for shown, _ in runs], largest)
 
     def row(self, excitation: int) -> int:
         """The row of `added`, and of what is shown, with an excitation in its largest admissible size."""
@@ -254,6 +264,14 @@ def _noise_and_start(
     return noise, fits.state[0, 0, 0], prepared.rows.channels
 
 
+def _operating_point(recording: Recording, system: System) -> Tensor:
+    """(n_action,) commands about which a machine without a policy is excited: 0 or, where that is not inside a
+    command's range, the mean of those recorded."""
+    mean = np.concatenate([episode.action for episode in recording.episodes]).mean(0)
+    inside = np.array([action.low < 0 < action.high for action in system.actions])
+    return torch.from_numpy(np.where(inside, 0.0, mean)).double()
+
+
 def _excitations(system: System, period: float, samples: int, generator: torch.Generator) -> tuple[list[str], Tensor]:
     """Excitations of one command each, in words, and their values (N, samples, n_action) for a size of 1 (`SIZES`)."""
     time = period * torch.arange(samples, dtype=torch.float64)
@@ -293,7 +311,13 @@ def _simulate(
     whether all states stay within their ranges; the policy sees readings with noise."""
     substeps = math.ceil(recording.period / (SUBSTEP * system.prediction_time))
     world = World(system, effects, recording.period, substeps=substeps).double()
-    ranges = torch.tensor([variable.largest for variable in system.states], dtype=torch.float64)
+    low, high = torch.tensor([(one.low, one.high) for one in system.states], dtype=torch.float64).T
+    middle = (low + high) / 2
+    least, most = torch.lerp(middle, low, MARGIN), torch.lerp(middle, high, MARGIN)
+    least, most = torch.minimum(least, first), torch.maximum(most, first)  # a machine may rest at an end: an empty tank
+
+    def within(states: Tensor) -> Tensor:
+        return ((states >= least) & (states <= most)).all(1)
 
     def read(at: Tensor) -> Tensor:
         return at + noise * torch.randn(at.shape, generator=generator, dtype=at.dtype)
@@ -301,13 +325,13 @@ def _simulate(
     at = world.start(first.expand(len(added), -1))
     measured, at = world.measure(at, generator)
     history = History.start(read(measured), added.shape[-1])
-    readings, commands, inside = [measured], [], (at.state.abs() <= MARGIN * ranges).all(1)
+    readings, commands, inside = [measured], [], within(at.state)
     for t in range(added.shape[1]):
         command = added[:, t] if policy is None else actions(policy, system, history).to(added) + added[:, t]
         command = system.within_range(command)
         at = world.step(at, command)
         measured, at = world.measure(at, generator)
-        inside &= (at.state.abs() <= MARGIN * ranges).all(1)
+        inside &= within(at.state)
         at = replace(at, state=torch.where(inside[:, None], at.state, first))  # a run that left must stay finite
         history = history.acting(command).observing(read(measured))
         readings.append(measured)

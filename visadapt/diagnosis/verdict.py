@@ -16,7 +16,7 @@ from visadapt.diagnosis.search.model_comparison import ModelComparison
 from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.search.sensor_checks import CoarseSteps
 from visadapt.diagnosis.search.unexplained import SmoothFunction, smooth_functions
-from visadapt.diagnosis.words import CHANGES, ONE_BY_ONE, listed, number, plain, with_unit
+from visadapt.diagnosis.words import CHANGES, CHANGES_BETWEEN, ONE_BY_ONE, listed, number, plain, with_unit
 from visadapt.effects import EFFECTS, Effect, Parameter, QuadraticDrag, RotorDrag
 from visadapt.effects.aerial import AirDrag
 from visadapt.estimation.candidate import CandidateModel
@@ -117,12 +117,14 @@ def next_step(
 
 def one_by_one(apart: Sequence[ExplainedAlone]) -> str:
     """The warning of recordings that are explained one by one, and not together."""
-    each = (f"{one.source} by {_with_values(one.best) or 'the unchanged simulator'}" for one in apart)
+    each = (
+        f"{one.source} by {_with_values(one.best) if one.best.effects else 'the unchanged simulator'}" for one in apart
+    )
     return f"{ONE_BY_ONE}: {'; '.join(each)}"
 
 
 def in_turn(changes: Sequence[Changing]) -> str:
-    """The warning of a recording that is explained by effects whose sizes change within it."""
+    """The warning of recordings that are explained by effects whose sizes change within one, or between them."""
     sets = []
     for one in changes:
         turns = iter(zip(*one.values, strict=True))  # of each parameter, from stretch to stretch
@@ -131,8 +133,10 @@ def in_turn(changes: Sequence[Changing]) -> str:
             values = [_in_turn(parameter, next(turns)) for parameter in effect.table]
             parts.append(f"{plain(effect.name)} ({', '.join(values)})")
         sets.append(listed(parts))
-    count = len(changes[0].values)
-    return f"{CHANGES}: {count} stretches of it, one after the other, are explained by {listed(sets, 'or')}"
+    first = changes[0]
+    if first.files:
+        return f"{CHANGES_BETWEEN}: {listed(first.files)}, in this order, are explained by {listed(sets, 'or')}"
+    return f"{CHANGES}: {len(first.values)} stretches of it, one after the other, are explained by {listed(sets, 'or')}"
 
 
 def _in_turn(parameter: Parameter, values: Sequence[float]) -> str:
@@ -233,6 +237,12 @@ def of_many(causes: int) -> list[str]:
         f"{causes} causes at once may stand for one effect that is not in the catalogue: see whether they keep their "
         "values in another recording, at other speeds"
     ]
+
+
+def of_one_explanation(comparison: ModelComparison) -> list[str]:
+    """A warning that the terms of Theorem 1 hold for one of several explanations; delays leave the step as it is."""
+    names = listed([plain(effect.name) for effect in comparison.best.effects])
+    return [f"Theorem 1's terms are those with {names}; with another explanation they may differ"]
 
 
 def hovers(search: Search, comparison: ModelComparison, found: Sequence[Cause]) -> list[str]:

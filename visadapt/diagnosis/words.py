@@ -21,6 +21,9 @@ ONE_BY_ONE = "each recording is explained by itself, but not all together"
 CHANGES = "the size of an effect changes within the recording"
 """What the warning begins with of a recording in which the size of an effect changes."""
 
+CHANGES_BETWEEN = "the size of an effect changes from one recording to the next"
+"""What it begins with where the size is another in each of several recordings."""
+
 A_ROW_LATE = "the commands were moved a row up"
 """What it warns of where each command was recorded a row late."""
 PART_LATE = "they were moved earlier by as much"
@@ -35,7 +38,7 @@ BETWEEN_ROWS = (
 OPPOSITE = " has the opposite sign of the source's"
 """What a diagnosis warns of, after the quantity's name, where it inverted a sign of the recording."""
 
-DERIVED = "derived on the rig, not measured; left out"
+DERIVED = "derived from it on the rig, or filtered; left out"
 """What it warns of where it set a velocity aside."""
 
 MISFIT = "root mean square of frames less those drawn by the renderer, in grey levels of 255"

@@ -61,8 +61,7 @@ class SystemProfile:
     """iterations of a fit between two computations of the derivatives by the states; more than 1 is accurate enough
     where all states are measured"""
     check_sensors: bool = True
-    """whether to look for defective angle sensors, other sign conventions, and velocities differentiated from
-    positions"""
+    """whether to look for defective angle sensors, and other sign conventions"""
     angle_sensor: Columns = ()  # columns of the angle, and of its rate, whose sensor is checked for defects
     sign_conventions: tuple[Convention, ...] = ()
     """sign conventions, other than the source's, in which a recording may be"""

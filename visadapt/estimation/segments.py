@@ -76,14 +76,16 @@ class Segments:
 
     @cached_property
     def filled(self) -> Tensor:
-        """(W, T, m) readings; those that may not be used are interpolated between those of the window that may."""
+        """(W, T, m) readings; those that may not be used are interpolated between those of the window that may, and at
+        its ends extrapolated by as much as the first, or last, two of these are apart: a vehicle flies on."""
         missing = (self.used == 0) & (self.inside[..., None] > 0)
         if not bool(missing.any()):
             return self.measured
         out = self.measured.clone()
         for window in missing.any(2).any(1).nonzero()[:, 0].tolist():
             own = self.inside[window] > 0
-            out[window, own] = interpolated(out[window, own], self.used[window, own], self.time[window, own])
+            part = out[window, own], self.used[window, own], self.time[window, own]
+            out[window, own] = interpolated(*part) + _beyond_ends(*part)
         return out
 
     @property
@@ -133,6 +135,21 @@ def interpolated(values: Tensor, used: Tensor, stamps: Tensor) -> Tensor:
         for column, kept in zip(values.numpy().T, used.numpy().T > 0, strict=True)
     ]
     return torch.tensor(np.stack(columns, 1))
+
+
+def _beyond_ends(values: Tensor, used: Tensor, stamps: Tensor) -> Tensor:
+    """(T, m) how much further than the first and the last readings (T, m) that are `used` (T, m) the rows before and
+    after these are, at the rates between the two readings next to them, and as far in time as these at most."""
+    out = torch.zeros_like(values)
+    for column, value, kept in zip(out.T, values.T, used.T > 0, strict=True):
+        known = kept.nonzero()[:, 0]
+        if len(known) < 2:
+            continue
+        for end, inner in ((known[0], known[1]), (known[-1], known[-2])):
+            apart = stamps[end] - stamps[inner]
+            share = ((stamps - stamps[end]) / apart).clamp(0, 1)  # 0 on the inner side
+            column += share * (value[end] - value[inner])
+    return out
 
 
 def smoothly_filled(values: Tensor, used: Tensor, stamps: Tensor) -> Tensor:

@@ -81,18 +81,20 @@ def check_commands(episodes: Sequence[RawEpisode], system: System, note: Note) -
                 )
             continue
         scale = max(-variable.low, variable.high)
-        raw = max(episodes, key=lambda raw: float(np.abs(raw.action[:, column]).max()))
-        row = int(np.abs(raw.action[:, column]).argmax())
-        largest = raw.action[row, column]
+        middle = (variable.low + variable.high) / 2
+        off = [np.abs(raw.action[:, column] - middle) for raw in episodes]
+        raw, most = max(zip(episodes, off, strict=True), key=lambda pair: float(pair[1].max()))
+        row = int(most.argmax())
+        farthest = raw.action[row, column]
         right = f"within [{variable.low:g}, {variable.high:g}] is right"
-        if share > 0.5 or abs(largest) > 2 * scale:
+        if share > 0.5 or abs(farthest) > 2 * scale:
             unit = "" if variable.unit == "1" else f" ({variable.unit})"
             hint = " (name a column in N 'force')" if not unit and hasattr(system, "max_force") else unit
             raise RecordingError(
-                f"{raw.cell(row, variable.name)} is {largest:g}, and {share:.0%} of the column lie outside; "
+                f"{raw.cell(row, variable.name)} is {farthest:g}, and {share:.0%} of the column lie outside; "
                 f"{right}{hint}"
             )
-        note(f"{share:.1%} of {variable.name} lie outside, up to {largest:g}; {right}", "the recording")
+        note(f"{share:.1%} of {variable.name} lie outside, {farthest:g} the farthest; {right}", "the recording")
 
 
 def check_units(episodes: Sequence[RawEpisode], system: System) -> None:

@@ -23,6 +23,8 @@ Floats = NDArray[np.float64]
 ENTERED_STEPS, LEFT_STEPS = 2.5, 1.5
 """Changes into and out of a run of equal readings, of which the larger exceeds ENTERED_STEPS of the sensor's steps and
 the smaller LEFT_STEPS: the sensor moved on, so a reading that it repeats was held."""
+ROUNDING = 1e-9  # Difference of two values, over the largest, up to which they are the same
+MOST_STEPS = 50  # Steps in an encoder's range for each value that it reads, at most
 LONGEST_RUN = 6.0
 """Rows of a run, over the median, up to which the machine cannot have rested within it."""
 MOST_DISPERSION = 0.5
@@ -30,6 +32,8 @@ MOST_DISPERSION = 0.5
 sensor with a clock of its own, even one that misses some readings."""
 LEAST_LOG_ODDS = 12.0
 """Log likelihood that the intervals' own distribution gains over that of rows lost at random, at least."""
+MOST_SHARED = 0.9
+"""Share of the rows in which another sensor is read anew, above which one that changes in these alone is read there."""
 LEAST_ZERO = 0.25
 """Share of zeros among a rate's values while its moving position is held, above which it is derived from that."""
 FEWEST_EMPTY = 3
@@ -42,7 +46,13 @@ def without_held_readings(episodes: Sequence[RawEpisode], system: System, note: 
     if not episodes:
         return []
     origin, names = str(episodes[0].path), list(episodes[0].measured)
-    found = {name: fresh for name in names if (fresh := _fresh([raw.states[name] for raw in episodes])) is not None}
+    values = {name: [raw.states[name] for raw in episodes] for name in names}
+    found = {name: fresh for name in names if (fresh := _fresh(values[name])) is not None}
+    for name in names:
+        # In steady motion all steps are alike, as an encoder's: what tells is that others are read in the same rows.
+        for other in [] if name in found else list(found.values()):
+            if _changes_only_in(values[name], other):
+                found[name] = other
     for name in [*found]:
         rate = system.rate_of(name)
         if rate in names and _is_derived([(raw.states[rate], raw.states[name]) for raw in episodes], found[name]):
@@ -53,7 +63,7 @@ def without_held_readings(episodes: Sequence[RawEpisode], system: System, note: 
     for name, fresh in found.items():
         share = float(np.concatenate(fresh).mean())
         period = float(np.median(np.concatenate([np.diff(raw.time) for raw in episodes])))
-        told.setdefault(f"{1 / share:.2g} rows ({period / share:.2g} s)", []).append(name)
+        told.setdefault(f"{1 / share:.3g} rows ({period / share:.2g} s)", []).append(name)
     for every, slow in told.items():
         note(
             f"{', '.join(slow)}: read about every {every} and held in between: only new readings are used, which may "
@@ -65,6 +75,13 @@ def without_held_readings(episodes: Sequence[RawEpisode], system: System, note: 
         usable = [found[name][number] if name in found else np.ones(len(raw.time), bool) for name in names]
         out.append(with_usable(raw, np.column_stack(usable), system) if found else raw)
     return out
+
+
+def _changes_only_in(episodes: Sequence[Floats], fresh: Sequence[NDArray[np.bool_]]) -> bool:
+    """Whether a sensor's values (T,) change in rows alone in which another's are `fresh` (T,), and in most of these."""
+    changed = np.concatenate([np.diff(values) != 0 for values in episodes])
+    read = np.concatenate([rows[1:] for rows in fresh])
+    return not bool((changed & ~read).any()) and float(changed.sum()) > MOST_SHARED * float(read.sum())
 
 
 def _is_derived(pairs: Sequence[tuple[Floats, Floats]], fresh: Sequence[NDArray[np.bool_]]) -> bool:
@@ -119,9 +136,9 @@ def _fresh(episodes: Sequence[Floats]) -> list[NDArray[np.bool_]] | None:
     """Which of a sensor's values (T,) of episodes are new readings; None where it is as fast as the rows, or repeats at
     random."""
     starts = [np.array([start for start, _ in runs(values)]) for values in episodes]
-    jumps = [np.abs(np.diff(values[first])) for values, first in zip(episodes, starts, strict=True)]
-    step = min((float(each.min()) for each in jumps if len(each)), default=0.0)
-    moving = [_moves(each, step) for each in jumps]
+    jumps = [np.diff(values[first]) for values, first in zip(episodes, starts, strict=True)]
+    step, is_encoder = _step(np.concatenate(episodes))
+    moving = [_moves(each, step, is_encoder) for each in jumps]
     lengths = [np.diff(first)[1:][moves] for first, moves in zip(starts, moving, strict=True)]
     held = [_repeated(first[1:-1][moves], own) for first, moves, own in zip(starts, moving, lengths, strict=True)]
     rows = _usual(np.concatenate([np.zeros(0), *lengths]))
@@ -141,12 +158,25 @@ def _fresh(episodes: Sequence[Floats]) -> list[NDArray[np.bool_]] | None:
     return out
 
 
-def _moves(jumps: Floats, step: float) -> NDArray[np.bool_]:
+def _step(values: Floats) -> tuple[float, bool]:
+    """The smallest difference of a sensor's values (T,), rounding errors aside, and whether it is an encoder's step:
+    values of a sensor without steps lie closer by chance."""
+    different = np.unique(values)
+    steps = np.diff(different)
+    steps = steps[steps > ROUNDING * np.abs(values).max()]
+    if not len(steps):
+        return 0.0, False
+    step = float(steps.min())
+    return step, float(np.ptp(values)) / step < MOST_STEPS * len(different)
+
+
+def _moves(jumps: Floats, step: float, is_encoder: bool) -> NDArray[np.bool_]:
     """Whether a sensor with this `step` moves on at both ends of each run, all but the first and the last, of readings
-    that jump by `jumps` from run to run."""
-    smaller, larger = np.minimum(jumps[:-1], jumps[1:]), np.maximum(jumps[:-1], jumps[1:])
+    that jump by `jumps` from run to run. Where a motion turns round, an encoder reads the same twice."""
+    size = np.abs(jumps)
+    smaller, larger = np.minimum(size[:-1], size[1:]), np.maximum(size[:-1], size[1:])
     moves: NDArray[np.bool_] = (smaller > LEFT_STEPS * step) & (larger > ENTERED_STEPS * step)
-    return moves
+    return moves & (jumps[:-1] * jumps[1:] > 0) if is_encoder else moves
 
 
 def _repeated(starts: NDArray[np.intp], lengths: NDArray[np.intp]) -> Floats:
@@ -168,7 +198,8 @@ def _is_regular(rows: Floats) -> bool:
         return False
     values, counts = np.unique(rows, return_counts=True)
     at_random = -np.log(mean) + (values - 1) * np.log1p(-1 / mean)
-    return float((counts * (np.log(counts / len(rows)) - at_random)).sum()) > LEAST_LOG_ODDS
+    gained = float((counts * (np.log(counts / len(rows)) - at_random)).sum())
+    return gained - len(values) > LEAST_LOG_ODDS  # each value's share was fitted
 
 
 def with_usable(raw: RawEpisode, usable: NDArray[np.bool_], system: System) -> RawEpisode:

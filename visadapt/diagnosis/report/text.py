@@ -26,6 +26,7 @@ from visadapt.diagnosis.words import (
     BESIDE_PUSHES,
     BETWEEN_ROWS,
     CHANGES,
+    CHANGES_BETWEEN,
     MISFIT,
     ONE_BY_ONE,
     chance,
@@ -173,6 +174,8 @@ def _unexplained(diagnosis: Diagnosis) -> str:
         )
     if any(warning.startswith(ONE_BY_ONE) for warning in diagnosis.warnings):
         return f"{_capitalised(ONE_BY_ONE)}: the machine, or a sensor, was changed between them (see the warning)."
+    if any(warning.startswith(CHANGES_BETWEEN) for warning in diagnosis.warnings):
+        return f"{_capitalised(CHANGES_BETWEEN)} (see the warning)."
     if any(warning.startswith(CHANGES) for warning in diagnosis.warnings):
         return (
             f"{_capitalised(CHANGES)}, as where a battery runs down, a bearing warms up or a load is dropped (see the "

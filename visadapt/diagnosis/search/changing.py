@@ -7,11 +7,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
 from visadapt.diagnosis.search.fitted_models import FittedModels, NoFitError, ScoredModel, key_of
 from visadapt.diagnosis.search.search import Search
 from visadapt.effects import Effect, Role
 from visadapt.estimation.fit_states import CAREFUL, neutral, posterior, with_effect
+from visadapt.recordings.episode import file_of
 
 MOST_PARTS, FEWEST_PARTS = 6, 3
 """A recording is cut into MOST_PARTS stretches, or its windows, where these are fewer, but FEWEST_PARTS at least."""
@@ -41,15 +43,29 @@ class Changing:
     effects: tuple[type[Effect], ...]
     values: tuple[tuple[float, ...], ...]  # of their parameters, in each stretch, in the order of time
     log_odds: float
+    files: tuple[str, ...]  # which the stretches are, where sizes change from file to file alone; else none
 
 
-def changing(search: Search) -> tuple[Changing, ...]:
+def changing(search: Search, sources: Sequence[str]) -> tuple[Changing, ...]:
     """What explains a recording if its sizes may change within it, the most probable first; nothing, where they do not
-    or that does not explain it either."""
-    count = search.rows.shape[0]
-    if count < FEWEST_PARTS:
+    or that does not explain it either. Where sizes that change from file to file explain it, it is these.
+
+    `sources` are those of its episodes (`Recording.sources`).
+    """
+    windows = range(search.rows.shape[0])
+    files = [file_of(sources[episode]) for episode in search.rows.episode.tolist()]
+    names = tuple(dict.fromkeys(files))
+    if 1 < len(names) <= MOST_PARTS:
+        by_file = [torch.tensor([k for k in windows if files[k] == name]) for name in names]
+        if found := _between(search, by_file, names):
+            return found
+    if len(windows) < FEWEST_PARTS:
         return ()
-    parts = torch.arange(count).tensor_split(min(MOST_PARTS, count))
+    return _between(search, list(torch.arange(len(windows)).tensor_split(min(MOST_PARTS, len(windows)))), ())
+
+
+def _between(search: Search, parts: Sequence[Tensor], files: tuple[str, ...]) -> tuple[Changing, ...]:
+    """What explains a recording if its sizes may change from one of these parts, of the windows, to the next."""
     try:
         stretches = [
             FittedModels(search.system, search.rows.select(part), search.catalogue, jobs=search.jobs) for part in parts
@@ -58,14 +74,16 @@ def changing(search: Search) -> tuple[Changing, ...]:
         return ()
     best = search.best.log_odds
     for tried in _tried(search):
-        found = [one for each in tried if (one := _in_stretches(search, stretches, each))]
+        found = [one for each in tried if (one := _in_stretches(search, stretches, each, files))]
         if found := [one for one in found if one.log_odds > best + MIN_LOG_ODDS]:
             found.sort(key=lambda one: -one.log_odds)
             return tuple(one for one in found if one.log_odds >= found[0].log_odds - AS_LIKELY)
     return ()
 
 
-def _in_stretches(search: Search, stretches: Sequence[FittedModels], whole: ScoredModel) -> Changing | None:
+def _in_stretches(
+    search: Search, stretches: Sequence[FittedModels], whole: ScoredModel, files: tuple[str, ...]
+) -> Changing | None:
     """A set with sizes of its own in each stretch, if they change, and that explains the recording."""
     start = whole.fits.theta[0].tolist()
     fits = [each.fit([(whole.effects, with_effect(each.source.fits, start))], CAREFUL)[0] for each in stretches]
@@ -80,7 +98,7 @@ def _in_stretches(search: Search, stretches: Sequence[FittedModels], whole: Scor
     acts = [fit.log_odds > each.source.log_odds for each, fit in zip(stretches, fits, strict=True)]
     values = [tuple(fit.fits.theta[0].tolist()) if act else nothing for fit, act in zip(fits, acts, strict=True)]
     log_odds = sum(max(fit.log_odds, each.source.log_odds) for each, fit in zip(stretches, fits, strict=True))
-    return Changing(whole.effects, tuple(values), log_odds)
+    return Changing(whole.effects, tuple(values), log_odds, files)
 
 
 def _change(fits: Sequence[ScoredModel]) -> bool:

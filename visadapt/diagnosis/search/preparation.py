@@ -62,7 +62,9 @@ def prepare(
         pushes: the rows within them are in no window.
     """
     draft = _on_its_clock(_read(recording, system, pushes))
-    if profile_of(system).check_sensors:
+    if not profile_of(system).check_sensors:
+        draft = _without_derived_velocities(draft)
+    else:
         first = draft.source or draft.source_fit()
         draft = _without_derived_velocities(_without_defective_angles(replace(draft, source=first), first))
         # After the velocities, since those that lag make the wrong sign likelier.

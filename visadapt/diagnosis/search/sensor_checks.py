@@ -12,7 +12,7 @@ from visadapt.systems import System
 MAX_LAG = 0.2
 """Largest lag, in periods, of a measured velocity behind the slope of its position; backward differences lag by 0.5."""
 
-SURE = 2.0  # Standard errors by which a lag must exceed MAX_LAG: noise alone also gives lags in few readings
+SURE = 3.0  # Standard errors by which a lag must exceed MAX_LAG: noise alone also gives lags in few readings
 
 
 def derived_velocities(system: System, rows: Segments) -> dict[str, float]:
@@ -31,7 +31,8 @@ def derived_velocities(system: System, rows: Segments) -> dict[str, float]:
         position, velocity = rows.measured[..., rows.channels.index(position_of[channel])], rows.measured[..., k]
         acceleration = (velocity[:, 2:] - velocity[:, :-2]) / span
         error = velocity[:, 1:-1] - (position[:, 2:] - position[:, :-2]) / span
-        used = inside * rows.used[..., k].unfold(1, 3, 1).amin(-1)
+        read = rows.used[..., k] * rows.used[..., rows.channels.index(position_of[channel])]
+        used = inside * read.unfold(1, 3, 1).amin(-1)
         # Least squares of error = -lag acceleration.
         information = (acceleration.square() * used).sum()
         lag = -(error * acceleration * used).sum() / information
