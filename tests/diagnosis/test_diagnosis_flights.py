@@ -125,6 +125,32 @@ def test_flights_need_not_be_equally_long(system, effect, true):
     assert estimate.value == pytest.approx(true, abs=1.5 * (estimate.ci90[1] - estimate.ci90[0]))
 
 
+@pytest.mark.parametrize("system", [Quadrotor(), FixedWing()])
+def test_velocities_that_lag_behind_their_positions_are_left_out(system):
+    whole = record(system, rows=60)
+    episodes = []
+    for one in whole.episodes:
+        state = one.state.copy()
+        for row in range(1, len(state)):  # a filter of two periods
+            state[row, 3:6] = state[row - 1, 3:6] + (one.state[row, 3:6] - state[row - 1, 3:6]) / 3
+        episodes.append(dataclasses.replace(one, state=state))
+    lagging = dataclasses.replace(whole, episodes=tuple(episodes))
+    result = diagnose(lagging, World(system, period=whole.period), [ThrustGain, LinearDrag])
+    assert sum("left out" in warning for warning in result.warnings) == 3
+    assert result.verdict == "no_gap"
+
+
+def test_a_flight_goes_on_before_the_first_fix_of_a_window():
+    """At 11.5 m/s it is 2 m farther from fix to fix."""
+    whole = record(FixedWing(), rows=60)
+    read = np.ones((60, 13), bool)
+    read[:, :3] = (np.arange(60) % 4 == 0)[:, None]
+    fixes = dataclasses.replace(whole, usable=(read,) * len(whole.episodes))
+    result = diagnose(fixes, World(FixedWing(), period=whole.period), [ThrustGain, LinearDrag])
+    assert result.verdict == "no_gap"
+    assert result.recording.noise["x"].value == pytest.approx(0.01, rel=0.2)
+
+
 @pytest.mark.parametrize("speed", [0.2, 1.0])
 def test_a_vehicle_that_hardly_moves_does_not_show_its_drag(speed):
     """The wind draws it away; in 4 s it comes to 0.7 of its speed."""

@@ -1,6 +1,7 @@
 """The planned experiment: it tells apart what a recording left open, keeps to the ranges, and says where none does."""
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import torch
 import visadapt as va
 from visadapt.diagnosis import planning
 from visadapt.diagnosis.result import Cause, Estimate, Gap, RecordingSummary, Where
+from visadapt.effects import catalogue as effects
 
 STATES = ("x", "x_dot", "theta", "theta_dot")
 NOISE = np.array([0.005, 0.02, 0.009, 0.05])
@@ -81,6 +83,41 @@ def test_the_file_is_what_is_added_over_time(tmp_path):
     path = tmp_path / "plan.csv"
     va.Plan((("gust",), ("spring",)), "a sine", time, added, ("command",), 12.0, 5.0).write(path)
     assert path.read_text().splitlines() == ["time,command", "0,0.1", "0.05,-0.2", "0.1,0.3"]
+
+
+@dataclass(frozen=True)
+class Tank(va.System):
+    """A tank with a hole that a pump fills, which never runs backwards."""
+
+    area: float = 0.015
+    name = "tank_with_a_pump"
+    prediction_time = 30.0
+    states = (va.Variable("level", "m", 0.0, 0.6),)
+    actions = (va.Variable("voltage", "V", 0.0, 12.0),)
+    loads = (va.Variable("inflow", "m3/s", -5e-5, 5e-5),)
+    coordinates = ((None, 0),)
+
+    def derivative(self, state, command, load):
+        out = 5e-5 * (2 * 9.81 * state.clamp(min=1e-4)).sqrt()
+        return (1e-5 * command - out + load) / self.area
+
+
+def test_a_machine_without_a_policy_is_excited_about_the_commands_recorded():
+    tank = Tank()
+    world, generator = va.World(tank, (), 4.0).double(), torch.Generator().manual_seed(0)
+    commands = 6 + torch.randn(60, 1, 1, generator=generator, dtype=torch.float64)
+    at, levels = world.start(torch.tensor([[0.07]], dtype=torch.float64)), []
+    for command in commands:
+        levels.append(at.state[0].numpy() + 0.001 * np.random.default_rng(len(levels)).normal(size=1))
+        at = world.step(at, command)
+    episode = va.Episode(4.0 * np.arange(60), commands[:, 0].numpy(), np.stack(levels))
+    recording = va.Recording((episode,), ("level",), 4.0, ("run.csv",))
+    effects.catalogue(tank)
+    found = ambiguous(("voltage.actuator_bias", "offset", -1.0), ("voltage.actuator_gain", "scale", 0.8))
+    planned = va.plan(found, recording, va.World(tank, (), 4.0), samples=40)
+    assert 0 <= planned.added.min() < 5
+    assert 7 < planned.added.max() <= 12
+    assert f", about voltage {float(commands.mean()):.3g} V)" in planned.excitation
 
 
 def test_a_pole_that_falls_needs_the_policy(pushed):

@@ -15,11 +15,13 @@ from torch import Tensor
 
 from visadapt.batch import Batch
 from visadapt.effects.late_sensors import LateSensors
-from visadapt.estimation.segments import ROUNDING_ERROR, Segments
+from visadapt.estimation.segments import Segments
 from visadapt.world import World
 
 Delays = Mapping[int, float]
 """Late states, by index, to the s by which they are read late."""
+
+ROUNDING_ERROR = 1e-6  # s, up to which two instants are the same
 
 Rows = slice | Tensor
 """Rows of every window, by a slice or by their indices."""

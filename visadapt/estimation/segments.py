@@ -16,22 +16,13 @@ from torch.nn.functional import pad
 from visadapt.estimation.colour import Colour
 from visadapt.estimation.profiles import profile_of
 from visadapt.interpolation import cubic
+from visadapt.recordings.resolution import smallest_step
 from visadapt.systems import System
 
 Stretch = tuple[int, int, int]
 """A part of an episode: the episode's index, the first row, and the row past the last."""
 
 MIN_STRETCH_ROWS = 15  # Of what is left of an episode where rows within it are left out, for it to be used
-
-NEAR_MULTIPLES, FEWEST_MULTIPLES, MOST_STEPS_APART = 20, 20, 1024
-"""A sensor's step is sought from differences of readings up to so many times the smallest, where there are at least so
-many; the smallest is at most so many steps."""
-
-MAX_REMAINDER = 0.1
-"""Mean distance of differences from whole numbers of a sensor's steps, in steps; 0.25 by chance."""
-
-ROUNDING_ERROR = 1e-6
-"""In a reading's unit; smaller differences between readings come from arithmetic, such as wrapping an angle."""
 
 
 @dataclass(frozen=True)
@@ -318,28 +309,4 @@ def stretches_without(bad: Sequence[Tensor], stretches: Sequence[Stretch]) -> li
 def resolutions(measured: Sequence[Tensor], valid: Sequence[Tensor]) -> list[float]:
     """The resolution of the sensor of each column of episodes (T, m), by its `valid` (T, m) readings."""
     readings, read = torch.cat([*measured]), torch.cat([*valid]) > 0
-    return [smallest_step(values[kept]) for values, kept in zip(readings.T, read.T, strict=True)]
-
-
-def smallest_step(readings: Tensor) -> float:
-    """A sensor's resolution: the largest step of which differences between readings (N,) are multiples; 0 if all
-    readings are equal.
-
-    Of a shaft that turns one way, no two readings may be as close as one step. Where no step shows, it is smaller than
-    all that were tried.
-    """
-    apart = readings.unique().diff()
-    apart = apart[apart > ROUNDING_ERROR]
-    if not len(apart):
-        return 0.0
-    least = float(apart.min())
-    near = apart[apart <= NEAR_MULTIPLES * least]
-    if len(near) < FEWEST_MULTIPLES:
-        return least
-    tried = least / torch.arange(1, MOST_STEPS_APART + 1, dtype=apart.dtype)
-    tried = tried[tried > 10 * ROUNDING_ERROR]
-    multiples = near / tried[:, None]
-    fits = (multiples - multiples.round()).abs().mean(1) < MAX_REMAINDER
-    if not len(tried):
-        return least
-    return float(tried[fits.int().argmax()] if fits.any() else tried[-1])
+    return [smallest_step(values[kept].numpy()) for values, kept in zip(readings.T, read.T, strict=True)]

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from visadapt.recordings.clock import Note, RawEpisode
 from visadapt.recordings.command_clock import in_gaps
+from visadapt.recordings.resolution import smallest_step
 from visadapt.recordings.runs import runs
 from visadapt.recordings.sensors import TURN, variable_of
 from visadapt.systems import System
@@ -23,7 +24,6 @@ Floats = NDArray[np.float64]
 ENTERED_STEPS, LEFT_STEPS = 2.5, 1.5
 """Changes into and out of a run of equal readings, of which the larger exceeds ENTERED_STEPS of the sensor's steps and
 the smaller LEFT_STEPS: the sensor moved on, so a reading that it repeats was held."""
-ROUNDING = 1e-9  # Difference of two values, over the largest, up to which they are the same
 MOST_STEPS = 50  # Steps in an encoder's range for each value that it reads, at most
 LONGEST_RUN = 6.0
 """Rows of a run, over the median, up to which the machine cannot have rested within it."""
@@ -137,7 +137,9 @@ def _fresh(episodes: Sequence[Floats]) -> list[NDArray[np.bool_]] | None:
     random."""
     starts = [np.array([start for start, _ in runs(values)]) for values in episodes]
     jumps = [np.diff(values[first]) for values, first in zip(episodes, starts, strict=True)]
-    step, is_encoder = _step(np.concatenate(episodes))
+    every = np.concatenate(episodes)
+    step = smallest_step(every)
+    is_encoder = float(np.ptp(every)) < MOST_STEPS * step * len(np.unique(every))
     moving = [_moves(each, step, is_encoder) for each in jumps]
     lengths = [np.diff(first)[1:][moves] for first, moves in zip(starts, moving, strict=True)]
     held = [_repeated(first[1:-1][moves], own) for first, moves, own in zip(starts, moving, lengths, strict=True)]
@@ -156,18 +158,6 @@ def _fresh(episodes: Sequence[Floats]) -> list[NDArray[np.bool_]] | None:
             fresh[start + np.round(mean * np.arange(round((end - start) / mean))).astype(int)] = True
         out.append(fresh)
     return out
-
-
-def _step(values: Floats) -> tuple[float, bool]:
-    """The smallest difference of a sensor's values (T,), rounding errors aside, and whether it is an encoder's step:
-    values of a sensor without steps lie closer by chance."""
-    different = np.unique(values)
-    steps = np.diff(different)
-    steps = steps[steps > ROUNDING * np.abs(values).max()]
-    if not len(steps):
-        return 0.0, False
-    step = float(steps.min())
-    return step, float(np.ptp(values)) / step < MOST_STEPS * len(different)
 
 
 def _moves(jumps: Floats, step: float, is_encoder: bool) -> NDArray[np.bool_]:
