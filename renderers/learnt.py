@@ -41,7 +41,9 @@ class MLPRenderer(nn.Module):
 
 ALONG_TRACK = 15  # Positions of the cart, evenly spaced, from whose frames the background is taken
 
-FAINTEST = 20.0  # Grey levels of 255 up to which a difference from the background is none
+FIRST_FRAMES = 1000  # Most frames, spread evenly, from which a training starts
+
+FAINT_GREY = 20.0  # Grey levels of 255 up to which a difference from the background is none
 
 NEAREST = 0.1
 """Least distance of the plane of motion from the camera, over that at the hinge: what is farther to the side is behind
@@ -51,10 +53,11 @@ the camera."""
 class Layer(nn.Module):
     """A learnt picture, with learnt opacity, that moves rigidly with the cart and may turn with the pole.
 
-    A pixel p of the frame shows the picture at R(theta) (p - hinge(x)) + moved, where hinge(x) = origin + gain x is the
-    learnt camera and `moved` the distance of the origin from its first guess. With `moved`, a step of the origin
-    changes the point about which the picture turns but not its place at theta = 0; without it, every step of the
-    camera would blur what the picture has learnt so far. The picture has `detail` texels per pixel; `window` is
+    A pixel whose place is p, as a camera square to the plane of motion would see it, shows the picture at R(theta) (p -
+    hinge(x)) + moved, where hinge(x) = origin + gain x, and `moved` is the distance of the origin from its first guess.
+    With `moved`, a step of the origin changes the point about which the picture turns but not its place at theta = 0;
+    without it, every step of the camera would blur what the picture has learnt so far. The picture has `detail` texels
+    per pixel; `window` is
     (left, right, top, bottom) in px around the first guess of the hinge at theta = 0.
     """
 
@@ -71,8 +74,8 @@ class Layer(nn.Module):
         self.shade = nn.Parameter(torch.zeros(1, rows, columns))
         self.opacity = nn.Parameter(torch.full((1, rows, columns), -2.0))
 
-    def forward(self, pixels: Tensor, hinge: Tensor, theta: Tensor, moved: Tensor) -> Tensor:
-        """Shade times opacity, and opacity, (B, 2, H, W) at pixels (H, W, 3), each (column, row, 1).
+    def forward(self, places: Tensor, hinge: Tensor, theta: Tensor, moved: Tensor) -> Tensor:
+        """Shade times opacity, and opacity, (B, 2, H, W) at the places (H, W, 3) of pixels, each (column, row, 1).
 
         `hinge` (B, 2) and `moved` (2,) are in px, `theta` (B,) in rad.
         """
@@ -81,13 +84,13 @@ class Layer(nn.Module):
         turn = turn / self.extent[:, None]
         shift = -(turn @ hinge[..., None])[..., 0] + (moved - self.centre) / self.extent
         # One matrix product maps every pixel of all frames to its place in the picture.
-        place = torch.cat((turn, shift[..., None]), -1).flatten(0, 1) @ pixels.flatten(0, 1).T
+        place = torch.cat((turn, shift[..., None]), -1).flatten(0, 1) @ places.flatten(0, 1).T
         opacity = self.opacity.sigmoid()
         picture = torch.cat((self.shade.sigmoid() * opacity, opacity))
         # Zero padding makes everything outside the window transparent.
         return F.grid_sample(
             picture.expand(len(theta), -1, -1, -1),
-            place.view(len(theta), 2, *pixels.shape[:2]).movedim(1, -1),
+            place.view(len(theta), 2, *places.shape[:2]).movedim(1, -1),
             align_corners=True,
             padding_mode="zeros",
         )
@@ -139,57 +142,71 @@ class LayeredRenderer(nn.Module):
     @property
     def farthest(self) -> float:
         """Largest |x| in m at which the hinge is in the frame."""
-        column = float(self.origin[0].detach())
-        return max(column, self.size[1] - 1 - column) / max(1e-9, abs(float(self.gain[0].detach())))
+        return max(self._at_sides())
+
+    @property
+    def reach(self) -> float:
+        """Largest |x| in m at which the hinge is in the frame on either side of x = 0."""
+        return min(self._at_sides())
+
+    @torch.no_grad()
+    def _at_sides(self) -> list[float]:
+        """|x| in m of a hinge at the left and at the right side of the frame."""
+        sides = self.origin.new_tensor([[-0.5, float(self.guess[1])], [self.size[1] - 0.5, float(self.guess[1])]])
+        away = self._seen_squarely(sides)[:, 0] - self.origin[0]
+        return (away / self.gain[0].abs().clamp(min=1e-9)).abs().tolist()
 
     @torch.no_grad()
     def start_from(self, x: Tensor, frames: Tensor) -> None:
-        """Initialise the background, and how far down the cart goes a metre, from frames (N, H, W) uint8 at positions x
-        (N,) in m. In training, pictures that were learnt at other heights would hold the cart to these."""
-        evenly = torch.linspace(float(x.min()), float(x.max()), ALONG_TRACK, dtype=x.dtype)
-        still = frames[(x - evenly[:, None]).abs().argmin(1)].median(0).values  # shows what does not move
+        """Initialise the background, and the rows by which the cart is lower a metre further on, from frames (N, H, W)
+        uint8 at positions x (N,) in m.
+
+        Pictures that are learnt while the cart is drawn at wrong heights blur, and hold it to these.
+        """
+        few = torch.linspace(0, len(frames) - 1, min(len(frames), FIRST_FRAMES), device=frames.device).long()
+        x, frames = x[few].to(self.gain), frames[few]
+        along = torch.linspace(float(x.min()), float(x.max()), ALONG_TRACK).to(x)
+        still = frames[(x - along[:, None]).abs().argmin(1)].median(0).values  # shows what does not move
         self.background.copy_((still / 255).clamp(0.01, 0.99).logit())
-        first = int(self.guess[1].clamp(0, self.size[0] - 1))  # above it there is the pole, which turns
-        cart = (frames[:, first:].float() - still[first:].float()).abs()
-        cart = (cart - FAINTEST).clamp(min=0).sum(2)
+        top = int(self.guess[1].clamp(0, self.size[0] - 1))  # above it a pole that is upright moves too
+        cart = ((frames[:, top:].to(x) - still[top:].to(x)).abs() - FAINT_GREY).clamp(min=0).sum(2)
         seen = cart.sum(1) > 0
         if int(seen.sum()) > 2:
-            row = (cart @ torch.arange(cart.shape[1], dtype=cart.dtype))[seen] / cart[seen].sum(1)
-            off = x[seen] - x[seen].mean()
-            self.gain[1] = (off @ row) / off.square().sum().clamp(min=1e-12)
+            row = cart[seen] @ torch.arange(cart.shape[1]).to(x) / cart[seen].sum(1)
+            away = x[seen] - x[seen].mean()
+            self.gain[1] = (away @ row) / away.square().sum().clamp(min=1e-12)
 
     def forward(self, x: Tensor, theta: Tensor) -> Tensor:
         """Frames (B, H, W) of cart positions (B,) in m and pole angles (B,) in rad."""
         hinge = self.origin + self.gain * x[:, None]
         frame = self.background.sigmoid().expand(len(x), -1, -1)
         moved = self.origin - self.guess
-        pixels = self._seen_squarely(x)
+        columns, rows = (torch.arange(n, device=x.device, dtype=x.dtype) for n in (self.size[1], self.size[0]))
+        places = self._seen_squarely(torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1))
+        places = torch.cat((places, torch.ones_like(places[..., :1])), -1)
         for layer in (self.cart, self.pole):
-            first, last = self._rows(layer, hinge, moved, pixels[..., 1])
-            shade, opacity = layer(pixels[first:last], hinge, theta + self.tilt, moved).unbind(1)
+            first, last = self._rows(layer, hinge, moved, places[..., 1])
+            shade, opacity = layer(places[first:last], hinge, theta + self.tilt, moved).unbind(1)
             band = frame[:, first:last] * (1 - opacity) + shade
             frame = torch.cat((frame[:, :first], band, frame[:, last:]), 1)
         return frame
 
-    def _seen_squarely(self, like: Tensor) -> Tensor:
-        """(H, W, 3) where each pixel would be in the frame of a camera without distortion that is square to the plane
-        of motion: (column, row, 1).
+    def _seen_squarely(self, pixels: Tensor) -> Tensor:
+        """Where pixels (..., 2), each (column, row), would be in the frame of a camera without distortion that is
+        square to the plane of motion, (..., 2).
 
         A lens moves what it shows from the middle of the frame by a share that grows with the square of the distance
         (Brown 1971). A plane seen at an angle is a homography of the plane seen squarely: 4 numbers, beside the hinge's
         place, the scale and the tilt, which are other parameters (Hartley and Zisserman 2004, section 2.4).
         """
         height, width = self.size
-        columns, rows = (torch.arange(n, device=like.device, dtype=like.dtype) for n in (width, height))
-        pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1)
-        middle = 0.5 * torch.stack((columns[-1], rows[-1]))
-        off = pixels - middle
-        off = off * (1 + self.distortion * (2 * off / width).square().sum(-1, keepdim=True))
-        off = off + middle - self.guess
-        nearer = 1 + (off * self.perspective / width).sum(-1, keepdim=True)
-        wider = (off * self.stretch).sum(-1, keepdim=True)
-        square = torch.cat((off[..., :1] + wider, off[..., 1:]), -1) / nearer.clamp(min=NEAREST) + self.guess
-        return torch.cat((square, torch.ones_like(wider)), -1)
+        middle = pixels.new_tensor([(width - 1) / 2, (height - 1) / 2])
+        from_middle = pixels - middle
+        straight = from_middle * (1 + self.distortion * (2 * from_middle / width).square().sum(-1, keepdim=True))
+        from_hinge = straight + middle - self.guess
+        distance = 1 + (from_hinge * self.perspective / width).sum(-1, keepdim=True)
+        stretched = from_hinge[..., :1] + (from_hinge * self.stretch).sum(-1, keepdim=True)
+        return torch.cat((stretched, from_hinge[..., 1:]), -1) / distance.clamp(min=NEAREST) + self.guess
 
     def _rows(self, layer: Layer, hinge: Tensor, moved: Tensor, rows: Tensor) -> tuple[int, int]:
         """The first row that a layer can cover and the one after the last; the others need not be computed. `rows` (H,

@@ -63,8 +63,8 @@ def load_renderer(path: Path, size: tuple[int, int] | None = None) -> LayeredRen
             raise
         what = " ".join(str(caught).split())
         raise RendererError(f"{path}: its header does not describe a known renderer ({what})") from caught
-    if kind is LayeredRenderer:  # One that was written before cameras could be at an angle
-        weights = {name: torch.zeros(shape) for name, shape in OF_ANY_CAMERA.items()} | weights
+    if kind is LayeredRenderer and OF_ANY_CAMERA.keys().isdisjoint(weights):  # Written before these were learnt
+        weights |= {name: torch.zeros(shape) for name, shape in OF_ANY_CAMERA.items()}
     try:
         sizes.load_state_dict(weights, assign=True)
     except RuntimeError as caught:

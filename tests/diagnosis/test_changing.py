@@ -62,10 +62,10 @@ Ridges.name = "ridges"  # only now, so that it is in no catalogue
 
 
 class Faint(Ridges):
-    """A twelfth of it."""
+    """A thirtieth of it."""
 
     def push(self, time, state, system):
-        return super().push(time, state, system) / 12
+        return super().push(time, state, system) / 30
 
 
 Faint.name = "faint"
@@ -82,6 +82,13 @@ def test_sizes_that_change_from_file_to_file_are_said_for_each():
     sizes = said.partition("viscous friction (coefficient ")[2].partition(" N")[0].split(", ")
     np.testing.assert_allclose([float(size) for size in sizes], [4.0, 1.5], rtol=0.1)
     assert str(found).startswith("unexplained: The size of an effect changes from one recording to the next")
+
+
+def test_of_a_file_that_nothing_explains_nothing_is_said():
+    both = one_after_the_other([[ViscousFriction(coefficient=3.0)]] * 3 + [[Ridges()]] * 3)
+    found = diagnose(dataclasses.replace(both, sources=("cold",) * 3 + ("warm",) * 3), World(CartPole()), CATALOGUE)
+    assert found.verdict == "unexplained"
+    assert not any(CHANGES_BETWEEN in warning for warning in found.warnings)
 
 
 @pytest.mark.parametrize("effects", [(), [ViscousFriction(coefficient=2.0)], [Ridges()]])

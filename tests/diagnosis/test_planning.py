@@ -106,7 +106,8 @@ def test_a_machine_without_a_policy_is_excited_about_the_commands_recorded():
     tank = Tank()
     world, generator = va.World(tank, (), 4.0).double(), torch.Generator().manual_seed(0)
     commands = 6 + torch.randn(60, 1, 1, generator=generator, dtype=torch.float64)
-    at, levels = world.start(torch.tensor([[0.07]], dtype=torch.float64)), []
+    at = world.start(torch.tensor([[0.07]], dtype=torch.float64))
+    levels: list[np.ndarray] = []
     for command in commands:
         levels.append(at.state[0].numpy() + 0.001 * np.random.default_rng(len(levels)).normal(size=1))
         at = world.step(at, command)
@@ -117,6 +118,7 @@ def test_a_machine_without_a_policy_is_excited_about_the_commands_recorded():
     planned = va.plan(found, recording, va.World(tank, (), 4.0), samples=40)
     assert 0 <= planned.added.min() < 5
     assert 7 < planned.added.max() <= 12
+    assert f": command {planned.excitation}, for " in str(planned)
     assert f", about voltage {float(commands.mean()):.3g} V)" in planned.excitation
 
 

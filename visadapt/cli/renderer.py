@@ -106,8 +106,12 @@ def _read_from(renderer: LayeredRenderer, x: Tensor, theta: Tensor, frames: Tens
     poses = PoseFinder(renderer, reach_of(renderer, CartPole()))(frames[few])
     if not poses.explained.any():
         return "no pose is read from them"
-    off = (poses.pose - torch.stack((x, theta), -1)[few])[poses.explained].abs().median(0).values
-    return f"x is read {off[0]:.2g} m off, theta {off[1]:.2g} rad (median)"
+    off_x, off_theta = (poses.pose - torch.stack((x, theta), -1)[few])[poses.explained].T
+    off_theta = torch.atan2(off_theta.sin(), off_theta.cos())  # theta may be given a turn further
+    return (
+        f"in {len(off_x)} of {len(few)} the pose is read, x {off_x.abs().median():.2g} m off and theta "
+        f"{off_theta.abs().median():.2g} rad (medians)"
+    )
 
 
 def _check(options: argparse.Namespace, x: Tensor, frames: Tensor) -> None:

@@ -44,7 +44,8 @@ CYCLES = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)  # In a prediction time, of square wave
 BIT_ROWS = (1, 2, 4, 8)  # Rows of a bit of a pseudo-random binary sequence
 SIZES = (0.05, 0.1, 0.14, 0.2, 0.28, 0.4, 0.57, 0.8)
 """Amplitudes that are tried, and the standard deviation of white noise, as shares of half the command's range."""
-MARGIN = 0.9  # Share of the states' ranges, about their middles, that an experiment may reach
+MARGIN = 0.9
+"""Share of the states' ranges, about their middles, that an experiment may reach; it may stay where it starts."""
 SUBSTEP = 0.025  # Longest integration step of a simulation, in prediction times
 WORTH = 3.0  # Log odds up to which an experiment is said to settle nothing
 CERTAIN = 100.0  # Log odds above which more make no difference
@@ -52,7 +53,7 @@ CERTAIN = 100.0  # Log odds above which more make no difference
 
 @dataclass(frozen=True)
 class Plan:
-    """An excitation that is added to a policy's commands, and what is expected of it.
+    """An excitation that is added to a policy's commands, or is all of the commands, and what is expected of it.
 
     >>> import numpy as np, visadapt as va
     >>> time, added = 0.05 * np.arange(201), np.zeros((201, 1))
@@ -74,6 +75,8 @@ class Plan:
     """expected log odds of the true against the other explanation, in the worst case"""
     white: float
     """the same for white noise of the largest admissible size; NaN where none is admissible"""
+    is_all: bool = False
+    """whether `added` is all of the commands: no policy was given"""
 
     @property
     def settles(self) -> bool:
@@ -85,13 +88,14 @@ class Plan:
         if not self.settles:
             return f"no excitation was found that tells {sets[0]} from {' or '.join(sets[1:])}"
         white = "" if math.isnan(self.white) else f"; {self.white:.0f} for white noise"
+        what = f"command {self.excitation}" if self.is_all else f"add {self.excitation} to the commands"
         return (
-            f"to tell {sets[0]} from {' or '.join(sets[1:])}: add {self.excitation} to the commands, for "
-            f"{self.time[-1]:.3g} s (expected log odds {self.log_odds:.0f}{white})"
+            f"to tell {sets[0]} from {' or '.join(sets[1:])}: {what}, for {self.time[-1]:.3g} s (expected log odds "
+            f"{self.log_odds:.0f}{white})"
         )
 
     def write(self, path: str | Path) -> None:
-        """Write a CSV with the columns `time` and, for each command, what is added to it."""
+        """Write a CSV with the columns `time` and, for each command, what is added to it, or all of it (`is_all`)."""
         with replacing(path) as temporary:
             header = ",".join(("time", *self.actions))
             np.savetxt(temporary, np.column_stack((self.time, self.added)), "%.9g", ",", header=header, comments="")
@@ -114,8 +118,8 @@ def plan(
         found: the diagnosis of `recording`.
         recording: of states; the experiment starts in its first state.
         source: the world that was diagnosed, without effects.
-        policy: gives the commands to which the excitation is added. Without one these are zero or, where that is no
-            command within the range but its end, the mean of those recorded, which the plan's `added` then holds too.
+        policy: gives the commands to which the excitation is added. Without one the excitation is all of the commands:
+            about 0 where that is inside the command's range, otherwise about the mean of those recorded.
         samples: length of the experiment, in commands.
         seed: of all noise drawn.
         progress: called with (excitations tried, excitations in all, best log odds so far).
@@ -153,6 +157,7 @@ def plan(
         actions=tuple(action.name for action in source.system.actions),
         log_odds=float(worth[best]),
         white=_highest(worth[white]),
+        is_all=policy is None,
     )
 
 
@@ -165,8 +170,8 @@ class _Trials:
     measured: tuple[int, ...]  # columns of the state
     noise: Tensor  # (n,) standard deviation of the readings of each state
     names: list[str]  # of the E excitations, in words
-    added: Tensor  # (sizes times E, T, n_action) to the commands
-    about: str  # the constant commands that `added` holds, in words
+    added: Tensor  # (sizes times E, T, n_action) to a policy's commands; without a policy, all of the commands
+    about: str  # the constant commands about which these are, in words
     shown: list[tuple[Tensor, Tensor]]  # of each explanation the readings and the commands, a row for each of `added`
     largest: Tensor  # (E,) the largest admissible of the SIZES of each excitation, by index; -1 without any
 

@@ -240,9 +240,10 @@ def of_many(causes: int) -> list[str]:
 
 
 def of_one_explanation(comparison: ModelComparison) -> list[str]:
-    """A warning that the terms of Theorem 1 hold for one of several explanations; delays leave the step as it is."""
-    names = listed([plain(effect.name) for effect in comparison.best.effects])
-    return [f"Theorem 1's terms are those with {names}; with another explanation they may differ"]
+    """A warning that the terms of Theorem 1 are those of one of several explanations: a delay of the sensors leaves the
+    simulator's step as it is, and one of the commands, which explains the recording as well, does not."""
+    names = listed([plain(effect.name) for effect in comparison.best.effects] or ["the unchanged simulator"])
+    return [f"the terms for the policy are those with {names}; with another explanation they may differ"]
 
 
 def hovers(search: Search, comparison: ModelComparison, found: Sequence[Cause]) -> list[str]:

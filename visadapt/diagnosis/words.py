@@ -31,7 +31,8 @@ PART_LATE = "they were moved earlier by as much"
 OWN_CLOCK = "by a clock that is not that of the rows: a command is the mean of what was sent until the next row"
 """What it warns of where the controller sends at other times than the rows'."""
 BETWEEN_ROWS = (
-    "commands change between the rows: those that none shows were estimated from the readings, so sizes are not exact"
+    "commands change between the rows: those that are in no row were estimated from the readings, so sizes are not "
+    "exact"
 )
 """What it warns of where the controller is faster than the rows."""
 

@@ -129,8 +129,8 @@ def interpolated(values: Tensor, used: Tensor, stamps: Tensor) -> Tensor:
 
 
 def _beyond_ends(values: Tensor, used: Tensor, stamps: Tensor) -> Tensor:
-    """(T, m) how much further than the first and the last readings (T, m) that are `used` (T, m) the rows before and
-    after these are, at the rates between the two readings next to them, and as far in time as these at most."""
+    """(T, m) the change from the first reading that is `used` (T, m) back to each row before it, and from the last one
+    to each row after it: at the rate between the two readings at that end, for as long as these are apart at most."""
     out = torch.zeros_like(values)
     for column, value, kept in zip(out.T, values.T, used.T > 0, strict=True):
         known = kept.nonzero()[:, 0]

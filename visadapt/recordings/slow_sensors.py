@@ -33,7 +33,8 @@ sensor with a clock of its own, even one that misses some readings."""
 LEAST_LOG_ODDS = 12.0
 """Log likelihood that the intervals' own distribution gains over that of rows lost at random, at least."""
 MOST_SHARED = 0.9
-"""Share of the rows in which another sensor is read anew, above which one that changes in these alone is read there."""
+"""Share of the rows in which a sensor that is held changes, above which another that changes in these alone is held
+too."""
 LEAST_ZERO = 0.25
 """Share of zeros among a rate's values while its moving position is held, above which it is derived from that."""
 FEWEST_EMPTY = 3
@@ -48,11 +49,11 @@ def without_held_readings(episodes: Sequence[RawEpisode], system: System, note: 
     origin, names = str(episodes[0].path), list(episodes[0].measured)
     values = {name: [raw.states[name] for raw in episodes] for name in names}
     found = {name: fresh for name in names if (fresh := _fresh(values[name])) is not None}
-    for name in names:
-        # In steady motion all steps are alike, as an encoder's: what tells is that others are read in the same rows.
-        for other in [] if name in found else list(found.values()):
-            if _changes_only_in(values[name], other):
-                found[name] = other
+    for name in [one for one in names if one not in found]:
+        # In steady motion all steps are alike, as an encoder's: what tells is that another changes in the same rows.
+        other = next((one for one in found if _change_together(values[name], values[one])), None)
+        if other is not None:
+            found[name] = found[other]
     for name in [*found]:
         rate = system.rate_of(name)
         if rate in names and _is_derived([(raw.states[rate], raw.states[name]) for raw in episodes], found[name]):
@@ -77,11 +78,11 @@ def without_held_readings(episodes: Sequence[RawEpisode], system: System, note: 
     return out
 
 
-def _changes_only_in(episodes: Sequence[Floats], fresh: Sequence[NDArray[np.bool_]]) -> bool:
-    """Whether a sensor's values (T,) change in rows alone in which another's are `fresh` (T,), and in most of these."""
-    changed = np.concatenate([np.diff(values) != 0 for values in episodes])
-    read = np.concatenate([rows[1:] for rows in fresh])
-    return not bool((changed & ~read).any()) and float(changed.sum()) > MOST_SHARED * float(read.sum())
+def _change_together(episodes: Sequence[Floats], others: Sequence[Floats]) -> bool:
+    """Whether a sensor's values (T,) change in most of the rows in which another's, which is held, do, and in no
+    other."""
+    changed, other = (np.concatenate([np.diff(values) != 0 for values in each]) for each in (episodes, others))
+    return not bool((changed & ~other).any()) and float(changed.sum()) > MOST_SHARED * float(other.sum())
 
 
 def _is_derived(pairs: Sequence[tuple[Floats, Floats]], fresh: Sequence[NDArray[np.bool_]]) -> bool:

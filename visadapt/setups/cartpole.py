@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from renderers import Camera, LayeredRenderer, RendererError, load_renderer
+from renderers import LayeredRenderer, RendererError, load_renderer
 from visadapt.effects import CameraEffect
 from visadapt.learning.grounding import GroundSettings
 from visadapt.learning.perception import PerceptionSettings, train_encoder
@@ -179,8 +179,7 @@ def cartpole_frames(
 
 def _narrowed(settings: SetupSettings, renderer: LayeredRenderer) -> SetupSettings:
     """The settings with all positions of the cart scaled down, where the camera sees less than `FULL_VIEW`."""
-    camera = Camera(width=renderer.size[1], scale=float(renderer.gain[0]), column=float(renderer.origin[0]))
-    share = camera.reach / FULL_VIEW
+    share = renderer.reach / FULL_VIEW
     if share >= 1:
         return settings
 

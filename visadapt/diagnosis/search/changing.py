@@ -1,4 +1,5 @@
-"""Effects whose size changes within a recording: a battery runs down, a bearing warms up, a load is dropped."""
+"""Effects whose size changes within a recording, or between recordings: a battery runs down, a bearing warms up, a load
+is dropped."""
 
 from __future__ import annotations
 
@@ -16,7 +17,8 @@ from visadapt.estimation.fit_states import CAREFUL, neutral, posterior, with_eff
 from visadapt.recordings.episode import file_of
 
 MOST_PARTS, FEWEST_PARTS = 6, 3
-"""A recording is cut into MOST_PARTS stretches, or its windows, where these are fewer, but FEWEST_PARTS at least."""
+"""Files are the stretches where there are MOST_PARTS at most, and sizes that change between them explain all. Otherwise
+the windows are cut into MOST_PARTS stretches, or are stretches themselves, FEWEST_PARTS at least."""
 
 MOST_TRIED = (4, 2)
 """Sets of one effect and of two that are tried, the most probable first: of two where no single one explains all."""
@@ -88,7 +90,7 @@ def _in_stretches(
     start = whole.fits.theta[0].tolist()
     fits = [each.fit([(whole.effects, with_effect(each.source.fits, start))], CAREFUL)[0] for each in stretches]
     left = sorted(each.without_process_noise([fit])[0].left for each, fit in zip(stretches, fits, strict=True))
-    if sum(left[:-1]) > MAX_LEFT * search.without_process_noise([whole])[0].left:
+    if sum(left if len(left) < FEWEST_PARTS else left[:-1]) > MAX_LEFT * search.without_process_noise([whole])[0].left:
         return None
     fits = [each.fitted[key_of(whole.effects)] for each in stretches]  # perhaps a better one, without process noise
     if not _change(fits):

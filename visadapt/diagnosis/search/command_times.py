@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from visadapt.diagnosis.search import sign_conventions
-from visadapt.diagnosis.search.draft import Draft, Readings, with_unmeasured_in_both
+from visadapt.diagnosis.search.draft import LEAST_READ, Draft, Readings, with_unmeasured_in_both
 from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.words import A_ROW_LATE, BETWEEN_ROWS, OWN_CLOCK, PART_LATE, number
 from visadapt.effects import Effect
@@ -31,6 +31,8 @@ None are fitted beside that of others, which is rare."""
 PARTS = (0.2, 0.1, 0.35, 0.5)
 """Parts of a row for which a controller that is faster than the rows may hold each command. The others are tried only
 where the first alone is likelier than commands that are held for a row."""
+
+FEWEST_ROWS = 4  # Of an episode, for each coefficient of the commands' regression on the readings
 
 Move = Callable[[Tensor, Tensor, Tensor], Tensor]
 """(commands (T, n) of an episode, each held until the next row; stamps (T,) of the rows, in s; readings (T, m)) to the
@@ -55,22 +57,22 @@ def with_commands_that_act(draft: Draft, catalogue: Sequence[type[Effect]]) -> D
     ):
         return a_row.told(f"each command is recorded a row late, beside the readings that it led to: {A_ROW_LATE}")
     late = draft.rows.period - a_row.delay(MOST_BESIDE_LATE if stamped else 0)
-    part = given
+    likelier = given
     if late > MIN_PART * draft.rows.period:
         earlier = _Moved.of(draft, catalogue, partial(_earlier, by=late))
         if sign_conventions.stays_ahead(earlier.search, given.search, EARLIER_LOG_ODDS):
-            part = earlier
-    if not stamped and (faster := _faster_than_rows(draft, catalogue, part)) is not None:
+            likelier = earlier
+    if not stamped and (faster := _faster_than_rows(draft, catalogue, likelier)) is not None:
         return faster
-    if part is not given:
-        return part.told(f"the commands act {number(late, 2)} s before the rows that they are in: {PART_LATE}")
+    if likelier is not given:
+        return likelier.told(f"the commands act {number(late, 2)} s before the rows that they are in: {PART_LATE}")
     return replace(draft, source=given.search.source.fits)
 
 
 def _faster_than_rows(draft: Draft, catalogue: Sequence[type[Effect]], slower: _Moved) -> Draft | None:
     """With an estimate of what the controller sent between the rows, if that is likelier than `slower` commands."""
-    if not all(bool(values.isfinite().all()) for values in draft.readings.states):
-        return None
+    if float(torch.cat(draft.readings.repeats.used).mean(0).min()) < LEAST_READ:
+        return None  # the controller may have other readings
     first, *others = (partial(_between_rows, part=part) for part in PARTS)
     best = _Moved.of(draft, catalogue, first)
     if best.source_likelihood < slower.source_likelihood + EARLIER_LOG_ODDS:
@@ -161,12 +163,14 @@ def _sent_until_next_row(command: Tensor, stamps: Tensor, states: Tensor) -> Ten
 
 
 def _between_rows(command: Tensor, stamps: Tensor, states: Tensor, part: float) -> Tensor:
-    """The mean, over each row, of what a controller sends that holds a command for this part of it.
+    """The mean command over each row, of a controller that holds each of its commands for this part of a row.
 
-    What it makes of the readings goes on as in the rows, on average to half way to the last command that it sends
-    within the row. What else is in a row's command acts for that part alone: the next command may have another.
+    The part of a recorded command that is linear in the readings around it is taken to change linearly until the next
+    row. The rest, noise say, acts for as long as a command is held: the next command may have another.
     """
     around = torch.cat((states[:1], states, states[-1:])).unfold(0, 3, 1).flatten(1)  # (T, 3 m), for the rates too
+    if len(command) < FEWEST_ROWS * around.shape[1]:
+        return command
     around = (around - around.mean(0)) / around.std(0).clamp(min=1e-300)
     known = torch.cat((torch.ones_like(around[:, :1]), around), 1)
     of_readings = known @ torch.linalg.lstsq(known, command).solution
