@@ -141,7 +141,7 @@ def _without_defective_angles(draft: Draft, source: FitState) -> Draft:
 
 
 def _without_derived_velocities(draft: Draft) -> Draft:
-    """Without velocities that were derived from positions on the rig."""
+    """Without velocities that were derived from positions on the rig, or filtered."""
     system, channels = draft.readings.system, draft.readings.channels
     derived = sensor_checks.derived_velocities(system, draft.rows)
     if not derived:

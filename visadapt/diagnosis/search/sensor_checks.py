@@ -1,4 +1,4 @@
-"""What readings show of sensors: velocities that were derived from positions, and steps that are coarse."""
+"""What readings show of sensors: velocities that lag behind their positions, and steps that are coarse."""
 
 from __future__ import annotations
 
