@@ -18,12 +18,21 @@ def test_from_recorded_frames_and_states(here, capsys):
     write_frames(here / "a.h5")
     write_frames(here / "b.h5", names=("x", "x_dot", "theta", "theta_dot"))
     assert run("renderer", "a.h5", "b.h5", *GUESS, "--iterations", 60, *OUT) == 0
-    assert "grey levels of 255 off where cart and pole are" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "grey levels of 255 off where cart and pole are" in said
+    assert "the pose is read, x 0.0" in said
     renderer = load_renderer(here / "r.safetensors")
     assert renderer.size == (40, 48)
     # Nearer to the camera than the guess, 1.5 px to the left of it.
     assert abs(float(renderer.state_dict()["origin"][0]) - CAMERA.column) < 1.0
     assert not (here / "r.safetensors.unfinished").exists()
+
+
+def test_of_a_video_it_is_said_what_is_right(here, capsys):
+    (here / "film.mp4").write_bytes(b"film")
+    assert "film.mp4: a video, which holds no states: an HDF5 file with" in refused(
+        capsys, "renderer", "film.mp4", *GUESS, *OUT
+    )
 
 
 def test_from_what_an_environment_shows(here, capsys):

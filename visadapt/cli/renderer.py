@@ -25,6 +25,7 @@ from visadapt.recordings import Episode
 from visadapt.recordings.checks import LEAST_ROWS, check_units
 from visadapt.recordings.clock import RawEpisode
 from visadapt.recordings.hdf5 import read_names, read_recording
+from visadapt.recordings.loading import VIDEOS
 from visadapt.recordings.physics import are_degrees
 from visadapt.recordings.sensors import TURN
 from visadapt.storage.atomic_files import replacing
@@ -156,6 +157,11 @@ def _from_recordings(paths: list[str]) -> tuple[Tensor, Tensor, Tensor]:
     states: list[NDArray[np.floating]] = []
     frames: list[NDArray[np.uint8]] = []
     for path in paths:
+        if Path(path).suffix.lower() in VIDEOS:
+            raise InputError(
+                f"{path}: a video, which holds no states: an HDF5 file with frames and states, as "
+                "visadapt.write_recording writes it, is right"
+            )
         names, _ = read_names(path, CartPole)
         for name in ("x", "theta"):
             if name not in names:
