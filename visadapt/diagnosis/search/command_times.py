@@ -34,6 +34,10 @@ where the first alone is likelier than commands that are held for a row."""
 
 FEWEST_ROWS = 4  # Of an episode, for each coefficient of the commands' regression on the readings
 
+LEAST_NOISE = 0.5
+"""Share of what of the commands is not linear in the readings that must be noise, new in each row, for a controller to
+be faster than the rows."""
+
 Move = Callable[[Tensor, Tensor, Tensor], Tensor]
 """(commands (T, n) of an episode, each held until the next row; stamps (T,) of the rows, in s; readings (T, m)) to the
 commands that act."""
@@ -71,8 +75,12 @@ def with_commands_that_act(draft: Draft, catalogue: Sequence[type[Effect]]) -> D
 
 def _faster_than_rows(draft: Draft, catalogue: Sequence[type[Effect]], slower: _Moved) -> Draft | None:
     """With an estimate of what the controller sent between the rows, if that is likelier than `slower` commands."""
-    if float(torch.cat(draft.readings.repeats.used).mean(0).min()) < LEAST_READ:
+    readings = draft.readings
+    if float(torch.cat(readings.repeats.used).mean(0).min()) < LEAST_READ:
         return None  # the controller may have other readings
+    rest = torch.cat([a - _of_readings(a, at) for a, at in zip(readings.commands, readings.states, strict=True)])
+    if not _noise(readings.commands).sum() > LEAST_NOISE * rest.square().mean(0).sum():
+        return None  # commands that are held for rows, or change smoothly, act as they are recorded
     first, *others = (partial(_between_rows, part=part) for part in PARTS)
     best = _Moved.of(draft, catalogue, first)
     if best.source_likelihood < slower.source_likelihood + EARLIER_LOG_ODDS:
@@ -168,11 +176,27 @@ def _between_rows(command: Tensor, stamps: Tensor, states: Tensor, part: float) 
     The part of a recorded command that is linear in the readings around it is taken to change linearly until the next
     row. The rest, noise say, acts for as long as a command is held: the next command may have another.
     """
+    of_readings = _of_readings(command, states)
+    half_way = 0.5 * (1 - part) * float(stamps.diff().median())
+    return _earlier(of_readings, stamps, states, half_way) + part * (command - of_readings)
+
+
+def _of_readings(command: Tensor, states: Tensor) -> Tensor:
+    """The part (T, n) of commands (T, n) that is linear in the readings (T, m) of the row, the one before and the one
+    after; all of them in an episode too short to tell."""
     around = torch.cat((states[:1], states, states[-1:])).unfold(0, 3, 1).flatten(1)  # (T, 3 m), for the rates too
     if len(command) < FEWEST_ROWS * around.shape[1]:
         return command
     around = (around - around.mean(0)) / around.std(0).clamp(min=1e-300)
     known = torch.cat((torch.ones_like(around[:, :1]), around), 1)
-    of_readings = known @ torch.linalg.lstsq(known, command).solution
-    half_way = 0.5 * (1 - part) * float(stamps.diff().median())
-    return _earlier(of_readings, stamps, states, half_way) + part * (command - of_readings)
+    return known @ torch.linalg.lstsq(known, command).solution
+
+
+def _noise(commands: Sequence[Tensor]) -> Tensor:
+    """(n,) variances of what is new in each row of commands (T, n), from the medians of their third differences: 0 of
+    commands that are held for rows, and nearly so of smooth ones."""
+    third = torch.cat([each.diff(n=3, dim=0) for each in commands]).abs()
+    if not len(third):
+        return third.new_zeros(third.shape[1])
+    # The squares of the coefficients 1, 3, 3 and 1 sum to 20; half of a normal distribution is within 0.6745.
+    return (third.median(0).values / 0.6745).square() / 20
