@@ -202,11 +202,12 @@ class LayeredRenderer(nn.Module):
         height, width = self.size
         middle = pixels.new_tensor([(width - 1) / 2, (height - 1) / 2])
         from_middle = pixels - middle
-        straight = from_middle * (1 + self.distortion * (2 * from_middle / width).square().sum(-1, keepdim=True))
-        from_hinge = straight + middle - self.guess
-        distance = 1 + (from_hinge * self.perspective / width).sum(-1, keepdim=True)
-        stretched = from_hinge[..., :1] + (from_hinge * self.stretch).sum(-1, keepdim=True)
-        return torch.cat((stretched, from_hinge[..., 1:]), -1) / distance.clamp(min=NEAREST) + self.guess
+        bent = from_middle * (self.distortion * (2 * from_middle / width).square().sum(-1, keepdim=True))
+        from_hinge = pixels - self.guess + bent
+        nearer = 1 / (1 + (from_hinge * self.perspective / width).sum(-1, keepdim=True)).clamp(min=NEAREST)
+        wider = (from_hinge * self.stretch).sum(-1, keepdim=True) * nearer
+        # As a sum, so that a square camera's pixels stay exactly where they are.
+        return pixels + bent + from_hinge * (nearer - 1) + torch.cat((wider, 0 * wider), -1)
 
     def _rows(self, layer: Layer, hinge: Tensor, moved: Tensor, rows: Tensor) -> tuple[int, int]:
         """The first row that a layer can cover and the one after the last; the others need not be computed. `rows` (H,
