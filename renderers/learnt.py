@@ -141,18 +141,20 @@ class LayeredRenderer(nn.Module):
 
     @property
     def farthest(self) -> float:
-        """Largest |x| in m at which the hinge is in the frame."""
-        return max(self._at_sides())
+        """Largest |x| in m at which the hinge is in the middle of a pixel."""
+        return max(self._at_sides(0.0))
 
     @property
     def reach(self) -> float:
         """Largest |x| in m at which the hinge is in the frame on either side of x = 0."""
-        return min(self._at_sides())
+        return min(self._at_sides(0.5))
 
     @torch.no_grad()
-    def _at_sides(self) -> list[float]:
-        """|x| in m of a hinge at the left and at the right side of the frame."""
-        sides = self.origin.new_tensor([[-0.5, float(self.guess[1])], [self.size[1] - 0.5, float(self.guess[1])]])
+    def _at_sides(self, beyond: float) -> list[float]:
+        """|x| in m of a hinge at the left and at the right side of the frame, `beyond` px outside of the last pixels'
+        middles."""
+        row = float(self.guess[1])
+        sides = self.origin.new_tensor([[-beyond, row], [self.size[1] - 1 + beyond, row]])
         away = self._seen_squarely(sides)[:, 0] - self.origin[0]
         return (away / self.gain[0].abs().clamp(min=1e-9)).abs().tolist()
 
