@@ -43,7 +43,8 @@ ALONG_TRACK = 15  # Positions of the cart, evenly spaced, from whose frames the 
 
 FIRST_FRAMES = 1000  # Most frames, spread evenly, from which a training starts
 
-FAINT_GREY = 20.0  # Grey levels of 255 up to which a difference from the background is none
+FAINT = 20 / 255
+"""Difference from the background up to which a pixel shows neither cart nor pole."""
 
 NEAREST = 0.1
 """Least distance of the plane of motion from the camera, over that at the hinge: what is farther to the side is behind
@@ -57,8 +58,7 @@ class Layer(nn.Module):
     hinge(x)) + moved, where hinge(x) = origin + gain x, and `moved` is the distance of the origin from its first guess.
     With `moved`, a step of the origin changes the point about which the picture turns but not its place at theta = 0;
     without it, every step of the camera would blur what the picture has learnt so far. The picture has `detail` texels
-    per pixel; `window` is
-    (left, right, top, bottom) in px around the first guess of the hinge at theta = 0.
+    per pixel; `window` is (left, right, top, bottom) in px around the first guess of the hinge at theta = 0.
     """
 
     centre: Tensor
@@ -171,7 +171,7 @@ class LayeredRenderer(nn.Module):
         still = frames[(x - along[:, None]).abs().argmin(1)].median(0).values  # shows what does not move
         self.background.copy_((still / 255).clamp(0.01, 0.99).logit())
         top = int(self.guess[1].clamp(0, self.size[0] - 1))  # above it a pole that is upright moves too
-        cart = ((frames[:, top:].to(x) - still[top:].to(x)).abs() - FAINT_GREY).clamp(min=0).sum(2)
+        cart = ((frames[:, top:].to(x) - still[top:].to(x)).abs() - 255 * FAINT).clamp(min=0).sum(2)
         seen = cart.sum(1) > 0
         if int(seen.sum()) > 2:
             row = cart[seen] @ torch.arange(cart.shape[1]).to(x) / cart[seen].sum(1)

@@ -49,10 +49,10 @@ def fit(
         raise ValueError(f"steps is {steps}, must be at least 3")
     renderer.start_from(x, frames)
     if isinstance(renderer, LayeredRenderer):
-        camera = ("origin", "gain", "tilt", "stretch", "perspective", "distortion")
-        pictures = [parameter for name, parameter in renderer.named_parameters() if name not in camera]
         places = [renderer.origin, renderer.gain]
         view = [renderer.tilt, renderer.stretch, renderer.perspective, renderer.distortion]
+        camera = {id(parameter) for parameter in (*places, *view)}
+        pictures = [parameter for parameter in renderer.parameters() if id(parameter) not in camera]
         groups = [{"params": pictures}, {"params": places}, {"params": view}]
         rates = [0.1, 0.05, 0.003]
     else:

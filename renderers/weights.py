@@ -14,8 +14,8 @@ from renderers.tensor_file import read_tensors, unsealed, write_tensors
 
 KINDS: dict[str, type[LayeredRenderer] | type[MLPRenderer]] = {"layered": LayeredRenderer, "mlp": MLPRenderer}
 FORMAT_VERSION = 1
-OF_ANY_CAMERA: dict[str, tuple[int, ...]] = {"stretch": (2,), "perspective": (2,), "distortion": ()}
-"""Shapes of the parameters that are 0 for a camera square to the plane of motion, without distortion."""
+OF_ANY_CAMERA = {"stretch", "perspective", "distortion"}
+"""Parameters that are 0 for a camera square to the plane of motion, without distortion."""
 HEADER_KEY = "renderers"
 """Key of the JSON, after its checksum, in the header of the safetensors file."""
 
@@ -63,8 +63,8 @@ def load_renderer(path: Path, size: tuple[int, int] | None = None) -> LayeredRen
             raise
         what = " ".join(str(caught).split())
         raise RendererError(f"{path}: its header does not describe a known renderer ({what})") from caught
-    if kind is LayeredRenderer and OF_ANY_CAMERA.keys().isdisjoint(weights):  # Written before these were learnt
-        weights |= {name: torch.zeros(shape) for name, shape in OF_ANY_CAMERA.items()}
+    if kind is LayeredRenderer and OF_ANY_CAMERA.isdisjoint(weights):  # Written before these were learnt
+        weights |= {name: torch.zeros(size.shape) for name, size in sizes.named_parameters() if name in OF_ANY_CAMERA}
     try:
         sizes.load_state_dict(weights, assign=True)
     except RuntimeError as caught:

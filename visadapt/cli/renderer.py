@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from renderers import LayeredRenderer, save_renderer
+from renderers.learnt import FAINT
 from renderers.training import fit
 from visadapt.cli.errors import InputError
 from visadapt.cli.progress import progress
@@ -25,7 +26,7 @@ from visadapt.recordings import Episode
 from visadapt.recordings.checks import LEAST_ROWS, check_units
 from visadapt.recordings.clock import RawEpisode
 from visadapt.recordings.hdf5 import read_names, read_recording
-from visadapt.recordings.loading import VIDEOS
+from visadapt.recordings.loading import refuse_video
 from visadapt.recordings.physics import are_degrees
 from visadapt.recordings.sensors import TURN
 from visadapt.storage.atomic_files import replacing
@@ -37,9 +38,6 @@ from visadapt.world import World
 
 CALIBRATION_STATES, CALIBRATION_RANGE = 4000, (1.0, 0.35)
 """States that an environment is put into, and the largest |x| in m and |theta| in rad of these."""
-
-FAINT = 20 / 255
-"""Difference from the background up to which a pixel shows neither cart nor pole."""
 
 NOT_LEARNT = 0.4
 """Error where cart and pole are, over how far they stand out, above which they are not where they are drawn."""
@@ -82,10 +80,9 @@ def run(options: argparse.Namespace) -> None:
         contrast = torch.maximum((seen - background).abs(), (drawn - background).abs())
         moves = contrast > FAINT
         error, stands_out = (255 * float(each[moves].abs().mean()) for each in (residual, contrast))
-        own = size_of(structure(residual))  # without noise
         if is_learnt := error <= NOT_LEARNT * stands_out:
             with replacing(out) as temporary:
-                save_renderer(temporary, renderer, {**settings, "error": own})
+                save_renderer(temporary, renderer, {**settings, "error": size_of(structure(residual))})
     if not is_learnt:  # The training is of no use, and a better guess makes another one
         raise InputError(
             f"the renderer has not learnt to draw these frames: where cart and pole are, it is {error:.0f} grey levels "
@@ -157,11 +154,7 @@ def _from_recordings(paths: list[str]) -> tuple[Tensor, Tensor, Tensor]:
     states: list[NDArray[np.floating]] = []
     frames: list[NDArray[np.uint8]] = []
     for path in paths:
-        if Path(path).suffix.lower() in VIDEOS:
-            raise InputError(
-                f"{path}: a video, which holds no states: an HDF5 file with frames and states, as "
-                "visadapt.write_recording writes it, is right"
-            )
+        refuse_video(path, "states")
         names, _ = read_names(path, CartPole)
         for name in ("x", "theta"):
             if name not in names:

@@ -209,12 +209,13 @@ def _found_before(explored: Explored, film: Film | None) -> list[tuple[Stage, fl
 def _next_step(answered: Answer, gap: Gap) -> str:
     """The experiment to make next, in words."""
     explored = answered.explored
-    if answered.verdict == UNEXPLAINED and explored.apart:
-        return OF_ONE_MACHINE
-    if answered.verdict == UNEXPLAINED and explored.changes:
-        return OF_ONE_MACHINE if explored.changes[0].files else AS_IT_CHANGES
-    if answered.verdict == UNEXPLAINED and BETWEEN_ROWS in explored.prepared.warnings:
-        return EVERY_COMMAND
+    if answered.verdict == UNEXPLAINED:
+        if explored.apart:
+            return OF_ONE_MACHINE
+        if explored.changes:
+            return OF_ONE_MACHINE if explored.changes[0].files else AS_IT_CHANGES
+        if BETWEEN_ROWS in explored.prepared.warnings:
+            return EVERY_COMMAND
     return next_step(
         explored.search,
         explored.comparison,

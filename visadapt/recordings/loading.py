@@ -164,6 +164,15 @@ def _files(paths: Sequence[str | os.PathLike[str]], note: Note) -> list[Path]:
     return [*files.values()]
 
 
+def refuse_video(path: str | os.PathLike[str], missing: str) -> None:
+    """Raise RecordingError of a video, which lacks what is `missing`."""
+    if Path(path).suffix.lower() in VIDEOS:
+        raise RecordingError(
+            f"{path}: a video, which holds no {missing}: an HDF5 file with its frames and the {missing}, as "
+            "visadapt.write_recording writes it, is right"
+        )
+
+
 def _is_recording(path: Path) -> bool:
     """Whether something in a folder is a recording: a file, or the folder of a bag of ROS 2."""
     return reader(path) is not None if path.is_dir() else path.is_file() and path.suffix.lower() in SUFFIXES
@@ -194,11 +203,7 @@ def _read(
             is_hdf5 = file.read(4) == b"\x89HDF"
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read: {error.strerror}") from error
-    if path.suffix.lower() in VIDEOS:
-        raise RecordingError(
-            f"{path}: a video, which holds no commands: an HDF5 file with its frames and the commands, as "
-            "visadapt.write_recording writes it, is right"
-        )
+    refuse_video(path, "commands")
     if frames and not is_hdf5:
         raise RecordingError(
             f"{path}: no HDF5 file; times, commands and frames as visadapt.write_recording writes them are right"

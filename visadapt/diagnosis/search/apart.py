@@ -6,10 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
 from visadapt.diagnosis.search.fitted_models import ScoredModel
 from visadapt.diagnosis.search.search import Search
 from visadapt.effects import Effect
+from visadapt.estimation.segments import Segments
 from visadapt.progress import Report, staged
 from visadapt.recordings.episode import file_of
 
@@ -37,13 +39,11 @@ def explained_apart(
         sources: of each episode (`Recording.sources`); those of a file are one recording. The first recording that is
             not explained by itself ends the attempt.
     """
-    files = [file_of(sources[episode]) for episode in search.rows.episode.tolist()]
-    names = list(dict.fromkeys(files))
-    if not 1 < len(names) <= MOST_RECORDINGS:
+    files = windows_by_file(search.rows, sources)
+    if not 1 < len(files) <= MOST_RECORDINGS:
         return ()
     out = []
-    for name in names:
-        windows = torch.tensor([window for window, file in enumerate(files) if file == name])
+    for name, windows in files.items():
         alone = Search(search.system, search.rows.select(windows), catalogue, jobs=search.jobs)
         alone.run(staged(progress, f"search in {name} alone"))
         if not alone.explains_all(alone.best):
@@ -51,3 +51,11 @@ def explained_apart(
         out.append(ExplainedAlone(name, alone.best))
     likelier = sum(one.best.log_odds for one in out) - search.best.log_odds
     return tuple(out) if likelier > MIN_LOG_ODDS else ()
+
+
+def windows_by_file(rows: Segments, sources: Sequence[str]) -> dict[str, Tensor]:
+    """Which windows are of each file, in the order of the files; `sources` are those of each episode."""
+    files: dict[str, list[int]] = {}
+    for window, episode in enumerate(rows.episode.tolist()):
+        files.setdefault(file_of(sources[episode]), []).append(window)
+    return {name: torch.tensor(windows) for name, windows in files.items()}

@@ -5,16 +5,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
+from visadapt.diagnosis.search.apart import windows_by_file
 from visadapt.diagnosis.search.fitted_models import FittedModels, NoFitError, ScoredModel, key_of
 from visadapt.diagnosis.search.search import Search
 from visadapt.effects import Effect, Role
 from visadapt.estimation.fit_states import CAREFUL, neutral, posterior, with_effect
-from visadapt.recordings.episode import file_of
 
 MOST_PARTS, FEWEST_PARTS = 6, 3
 """Files are the stretches where there are MOST_PARTS at most, and sizes that change between them explain all. Otherwise
@@ -45,7 +45,7 @@ class Changing:
     effects: tuple[type[Effect], ...]
     values: tuple[tuple[float, ...], ...]  # of their parameters, in each stretch, in the order of time
     log_odds: float
-    files: tuple[str, ...]  # which the stretches are, where sizes change from file to file alone; else none
+    files: tuple[str, ...] = ()  # which the stretches are, where sizes change from file to file alone; else none
 
 
 def changing(search: Search, sources: Sequence[str]) -> tuple[Changing, ...]:
@@ -54,19 +54,14 @@ def changing(search: Search, sources: Sequence[str]) -> tuple[Changing, ...]:
 
     `sources` are those of its episodes (`Recording.sources`).
     """
-    windows = range(search.rows.shape[0])
-    files = [file_of(sources[episode]) for episode in search.rows.episode.tolist()]
-    names = tuple(dict.fromkeys(files))
-    if 1 < len(names) <= MOST_PARTS:
-        by_file = [torch.tensor([k for k in windows if files[k] == name]) for name in names]
-        if found := _between(search, by_file, names):
-            return found
-    if len(windows) < FEWEST_PARTS:
-        return ()
-    return _between(search, list(torch.arange(len(windows)).tensor_split(min(MOST_PARTS, len(windows)))), ())
+    files = windows_by_file(search.rows, sources)
+    if 1 < len(files) <= MOST_PARTS and (found := _between(search, list(files.values()))):
+        return tuple(replace(one, files=tuple(files)) for one in found)
+    count = search.rows.shape[0]
+    return () if count < FEWEST_PARTS else _between(search, torch.arange(count).tensor_split(min(MOST_PARTS, count)))
 
 
-def _between(search: Search, parts: Sequence[Tensor], files: tuple[str, ...]) -> tuple[Changing, ...]:
+def _between(search: Search, parts: Sequence[Tensor]) -> tuple[Changing, ...]:
     """What explains a recording if its sizes may change from one of these parts, of the windows, to the next."""
     try:
         stretches = [
@@ -76,16 +71,14 @@ def _between(search: Search, parts: Sequence[Tensor], files: tuple[str, ...]) ->
         return ()
     best = search.best.log_odds
     for tried in _tried(search):
-        found = [one for each in tried if (one := _in_stretches(search, stretches, each, files))]
+        found = [one for each in tried if (one := _in_stretches(search, stretches, each))]
         if found := [one for one in found if one.log_odds > best + MIN_LOG_ODDS]:
             found.sort(key=lambda one: -one.log_odds)
             return tuple(one for one in found if one.log_odds >= found[0].log_odds - AS_LIKELY)
     return ()
 
 
-def _in_stretches(
-    search: Search, stretches: Sequence[FittedModels], whole: ScoredModel, files: tuple[str, ...]
-) -> Changing | None:
+def _in_stretches(search: Search, stretches: Sequence[FittedModels], whole: ScoredModel) -> Changing | None:
     """A set with sizes of its own in each stretch, if they change, and that explains the recording."""
     start = whole.fits.theta[0].tolist()
     fits = [each.fit([(whole.effects, with_effect(each.source.fits, start))], CAREFUL)[0] for each in stretches]
@@ -100,7 +93,7 @@ def _in_stretches(
     acts = [fit.log_odds > each.source.log_odds for each, fit in zip(stretches, fits, strict=True)]
     values = [tuple(fit.fits.theta[0].tolist()) if act else nothing for fit, act in zip(fits, acts, strict=True)]
     log_odds = sum(max(fit.log_odds, each.source.log_odds) for each, fit in zip(stretches, fits, strict=True))
-    return Changing(whole.effects, tuple(values), log_odds, files)
+    return Changing(whole.effects, tuple(values), log_odds)
 
 
 def _change(fits: Sequence[ScoredModel]) -> bool:

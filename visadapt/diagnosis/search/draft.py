@@ -27,7 +27,8 @@ MOST_FILLED = 2
 """Rows in a row whose readings are filled in by cubics: the acceleration in more of them would be made up."""
 
 LEAST_READ = 0.8
-"""Share of the rows in which a sensor is read, below which it gives the rows in which pushes are looked for."""
+"""Share of the rows in which a sensor is read, below which it is slower than the rows: it gives those in which pushes
+are looked for, and commands between the rows are not estimated from it."""
 
 
 @dataclass(frozen=True)
