@@ -57,13 +57,29 @@ def numbers(path, stamps, command=lambda time: 0.5 if time > -0.1 else np.nan):
 
 
 def test_a_slower_topic_gives_the_rows_and_the_others_are_interpolated(tmp_path):
-    stamps = {"/x": np.arange(0, 3, 0.05), "/theta": np.arange(0, 3, 0.005), "/u": np.arange(0, 3, 0.05)}
+    stamps = {"/x": np.arange(0, 3, 0.02), "/theta": np.arange(0, 3, 0.005), "/u": np.arange(0, 3, 0.05)}
     found = load_recording(numbers(tmp_path / "run", stamps), CartPole(), FIELDS)
     (episode,) = found.episodes
+    assert not found.usable
     turned = episode.state[:, 1] - 2 * episode.state[:, 0]
     np.testing.assert_allclose(turned, turned[0], atol=1e-5)
     np.testing.assert_allclose(episode.action, 0.5)
     assert "/theta is interpolated" in " ".join(found.warnings)
+
+
+def test_a_topic_that_is_much_slower_has_rows_of_its_own(tmp_path):
+    stamps = {"/x": np.arange(0.003, 6, 0.2), "/theta": np.arange(0, 6, 0.02), "/u": np.arange(0, 6, 0.05)}
+    found = load_recording(numbers(tmp_path / "run", stamps), CartPole(), FIELDS)
+    (episode,), (usable,) = found.episodes, found.usable
+    assert "/x, which is slower, has rows of its own" in " ".join(found.warnings)
+    x, angle = usable.T  # as a GPS receiver's and a gyro's, each at its own instants
+    assert (x != angle).all()
+    assert x.sum() == len(stamps["/x"])
+    assert angle.sum() == len(stamps["/theta"])
+    np.testing.assert_allclose(
+        episode.state[x, 0] - episode.time[x], episode.state[x, 0][0] - episode.time[x][0], atol=1e-6
+    )
+    np.testing.assert_allclose(np.diff(episode.state[angle, 1]), 0.04, atol=1e-6)
 
 
 def test_fields_in_other_units_are_converted_before_they_are_interpolated(tmp_path):
@@ -171,12 +187,12 @@ def test_a_bag_and_the_file_in_it_count_once(turned, tmp_path):
 
 
 def test_the_slower_topic_is_not_the_one_that_ends_first_and_what_is_cut_off_is_said(tmp_path):
-    stamps = {"/x": np.arange(0, 10, 0.05), "/theta": np.arange(0, 1.5, 0.01), "/u": np.arange(0.5, 10, 0.05)}
+    stamps = {"/x": np.arange(0, 10, 0.02), "/theta": np.arange(0, 1.5, 0.004), "/u": np.arange(0.5, 10, 0.02)}
     found = load_recording(numbers(tmp_path / "run", stamps), CartPole(), FIELDS)
-    assert found.period == pytest.approx(0.05)
+    assert found.period == pytest.approx(0.02)
     said = " ".join(found.warnings)
-    assert "10 rows before the first message of /u are left out" in said
-    assert "170 rows after the last message of /theta are left out" in said
+    assert "25 rows before the first message of /u are left out" in said
+    assert "425 rows after the last message of /theta are left out" in said
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,8 @@
 
 The topics of a log have stamps of their own, a recording has rows. A row is one reading of the topic with states whose
 messages are furthest apart. Readings of other topics are interpolated to its stamp, and its command is the mean of what
-was commanded until the next row, each command being held until the next one.
+was commanded until the next row, each command being held until the next one. A topic that is much slower, as that of a
+GPS receiver, has rows of its own instead, in which nothing else is measured.
 """
 
 from __future__ import annotations
@@ -27,6 +28,10 @@ from visadapt.systems.rigid_body import ATTITUDE, continuous_quaternion
 
 MOST_DISPLACED = 10
 """Places by which a message of a topic may come too early or too late, as a network delivers it, to be put in order."""
+
+MUCH_SLOWER, SLOW = 4.0, 0.05
+"""Interval between the messages of a topic that has rows of its own, over that of the fastest topic of states, and over
+the system's prediction time, at least: rows at this interval would miss much of the motion."""
 
 LEAST_KNOWN = 0.5
 """Share of the rows in which all numbers are known from which the others are left out: a column that has hardly any is
@@ -68,29 +73,26 @@ def read_log(path: Path, read: Read, system: System, given: Mapping[str, str], n
     log.check_messages()
     log = log.with_steady_clocks(note)
     rows = log.rows(note)
-    time = log.topics[log.slowest].time[rows]
+    time = rows.time
     action = np.column_stack([log.command(one.name, time) for one in system.actions])
-    states = np.column_stack([log.state(name, rows) for name in log.measured])
+    states = np.column_stack([log.state(name, time) for name in log.measured])
     kept = _whole(np.column_stack([action, states]))
-    if dropped := len(rows) - len(rows[kept]):
+    if dropped := len(time) - int(kept.sum()):
         note(f"{dropped} rows in which a number is missing are left out", str(path))
-    time, rows = time[kept], rows[kept]
-    others = "".join(f"; {name} is interpolated to them" for name in log.of_states if name != log.slowest)
-    note(f"rows are the readings of {log.slowest}{others}; a command is the mean until the next row", str(path))
-
-    def message(row: int) -> str:
-        return f"message {rows[row] + 1} of {log.slowest}"
-
-    names = {name: ".".join(column) for name, column in columns.items()}
+    others = "".join(f"; {name} is interpolated to them" for name in log.together if name != log.slowest)
+    apart = "".join(f"; {name}, which is slower, has rows of its own" for name in log.apart)
+    note(f"rows are the readings of {log.slowest}{others}{apart}; a command is the mean until the next row", str(path))
+    place = [f"message {index + 1} of {log.of_states[topic]}" for topic, index in rows.of[kept].tolist()]
     return RawEpisode(
         path,
-        time - time[0],
+        time[kept] - time[kept][0],
         action[kept],
         states[kept],
         log.measured,
-        message,
-        names,
+        place.__getitem__,
+        {name: ".".join(column) for name, column in columns.items()},
         given,
+        usable=log.read_in(rows)[kept] if log.apart else None,
         stamped_commands=not set(log.of_actions) & set(log.of_states),
     )
 
@@ -104,6 +106,14 @@ def _topics(path: Path, read: Read, wanted: Mapping[str, set[str]]) -> dict[str,
         reason = " ".join(str(error).split())[:200] or type(error).__name__
     # Raised here and not above, so that it does not hold on to the parser's error and what that has read.
     raise RecordingError(f"{path}: cannot be read as a log, is it cut short or damaged? {reason}")
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """The rows of a log."""
+
+    time: NDArray[np.float64]  # (T,) s
+    of: NDArray[np.intp]  # (T, 2) the topic, by its place in `_Log.of_states`, and the message that each row is
 
 
 @dataclass(frozen=True)
@@ -134,9 +144,25 @@ class _Log:
         return list(dict.fromkeys(self.columns[action.name][0] for action in self.system.actions))
 
     @cached_property
+    def apart(self) -> list[str]:
+        """The topics of states that have rows of their own, since they are MUCH_SLOWER than the fastest, and SLOW."""
+        fastest = min(self._interval(name) for name in self.of_states)
+        shortest = max(MUCH_SLOWER * fastest, SLOW * self.system.prediction_time)
+        return [name for name in self.of_states if self._interval(name) >= shortest]
+
+    @cached_property
+    def together(self) -> list[str]:
+        """The other topics of states."""
+        return [name for name in self.of_states if name not in self.apart]
+
+    @cached_property
     def slowest(self) -> str:
-        """The topic of states whose messages are furthest apart, which gives the rows."""
-        return max(self.of_states, key=lambda name: np.median(np.diff(self.topics[name].time)))
+        """The one of these whose messages are furthest apart, which gives the rows."""
+        return max(self.together, key=self._interval)
+
+    def _interval(self, name: str) -> float:
+        """s between the messages of a topic, the median."""
+        return float(np.median(np.diff(self.topics[name].time)))
 
     def check_messages(self) -> None:
         """Raises RecordingError where a topic has too few messages."""
@@ -159,17 +185,18 @@ class _Log:
                     )
         return replace(self, topics=topics)
 
-    def rows(self, note: Note) -> NDArray[np.intp]:
-        """The messages of the slowest topic (T,) for which all other topics have a value."""
-        topics = (*self.of_states, *self.of_actions)
+    def rows(self, note: Note) -> _Rows:
+        """The messages of the topic that gives the rows for which all others have a value, and those between them of
+        topics that are much slower."""
+        topics = (*self.together, *self.of_actions)
         begins = {name: self.topics[name].time[0] for name in topics}
-        ends = {name: self.topics[name].time[-1] for name in self.of_states}
+        ends = {name: self.topics[name].time[-1] for name in self.together}
         ends |= {name: _held_until(self.topics[name].time) for name in self.of_actions if name not in ends}
         last_to_begin, first_to_end = max(begins, key=begins.__getitem__), min(ends, key=ends.__getitem__)
         time = self.topics[self.slowest].time
         early, late = time < begins[last_to_begin], time > ends[first_to_end]
         used = ~early & ~late
-        for name in self.of_states:
+        for name in self.together:
             if name != self.slowest:
                 used &= _between_readings(time, self.topics[name].time)
         for name in self.of_actions:
@@ -184,13 +211,34 @@ class _Log:
             note(f"{early.sum()} rows before the first message of {last_to_begin} are left out", str(self.path))
         if late.any():
             note(f"{late.sum()} rows after the last message of {first_to_end} are left out", str(self.path))
-        return rows
+        parts = [(self.slowest, rows)]
+        for name in self.apart:
+            stamps = self.topics[name].time
+            own = np.flatnonzero((stamps >= time[rows[0]]) & (stamps <= time[rows[-1]]))
+            if len(own) < 2:
+                raise RecordingError(f"{self.path}: {name} and {self.slowest} have no time in common")
+            parts.append((name, own))
+        every = np.concatenate([self.topics[name].time[own] for name, own in parts])
+        of = np.concatenate(
+            [np.column_stack([np.full_like(own, self.of_states.index(name)), own]) for name, own in parts]
+        )
+        first = np.sort(np.unique(every, return_index=True)[1])  # one row where two topics have the same stamp
+        order = first[np.argsort(every[first])]
+        return _Rows(every[order], of[order])
 
-    def state(self, name: str, rows: NDArray[np.intp]) -> NDArray[np.float64]:
-        """A measured state in these rows (T,): as read there, or interpolated to the rows' stamps."""
+    def read_in(self, rows: _Rows) -> NDArray[np.bool_]:
+        """Which measured states are read in which rows (T, n_measured)."""
+        by_topic = {
+            name: np.isin(rows.time, self.topics[name].time)
+            if name in self.apart
+            else rows.of[:, 0] == self.of_states.index(self.slowest)
+            for name in self.of_states
+        }
+        return np.column_stack([by_topic[self.columns[name][0]] for name in self.measured])
+
+    def state(self, name: str, time: NDArray[np.float64]) -> NDArray[np.float64]:
+        """A measured state at these times (T,): as read then, or interpolated."""
         topic, values = self.columns[name][0], self.values(name)
-        if topic == self.slowest:
-            return values[rows]
         attitude = self.system.states[ATTITUDE] if isinstance(self.system, RigidBody) else ()
         quaternion = [state.name for state in attitude]
         if name in quaternion:
@@ -199,7 +247,7 @@ class _Log:
             values = continuous_quaternion(torch.from_numpy(whole)).numpy()[:, together.index(name)]
         if self.system.states[self.system.index(name)].unit == "rad":
             values = np.unwrap(values)
-        return np.interp(self.topics[self.slowest].time[rows], self.topics[topic].time, values)
+        return np.interp(time, self.topics[topic].time, values)
 
     def command(self, name: str, time: NDArray[np.float64]) -> NDArray[np.floating]:
         """The command of an action in rows with these stamps (T,)."""
