@@ -1,5 +1,5 @@
-"""Single readings that are no measurements: outliers and what a stuck sensor repeats are set aside, and an episode is
-split where a position is suddenly elsewhere.
+"""Readings that are no measurements: outliers, what a stuck sensor repeats, and what is written while none answers are
+set aside, and an episode is split where a position is suddenly elsewhere.
 
 Left in, they would look like a push to whoever differentiates the positions.
 """
@@ -31,6 +31,8 @@ STUCK_ROWS = 5
 STUCK_RATIO, STUCK_STEPS = 3.0, 8
 """Change of a position after its sensor stuck, over the next change and over the smallest of all, at least: a machine
 that dry friction held starts slowly instead."""
+OUTAGE_CHANCE = 1e-3
+"""Probability, up to which the rows of an episode that are lost one by one would repeat one as often somewhere."""
 JUMP_SCALES = 12.0
 """Departure of a change from those around it, over the median departure, from which on a position may have jumped."""
 JUMP_RATIO, AROUND_JUMP = 2.0, 5
@@ -40,7 +42,7 @@ DEVIATION_PER_MEDIAN = 1.4826
 
 
 def without_outliers(raw: RawEpisode, system: System, note: Note) -> RawEpisode:
-    """The episode with outliers and the readings of stuck sensors marked as not usable.
+    """The episode with outliers, and the readings of stuck sensors and of outages, marked as not usable.
 
     Outliers jump away and back faster than the state can move. Such rows keep time and command; their readings are
     interpolated.
@@ -81,6 +83,12 @@ def without_outliers(raw: RawEpisode, system: System, note: Note) -> RawEpisode:
                     f"{raw.cell(int(rows[start]), name)}, and {end - start - 1} rows after it",
                 )
                 bad[rows[start:end]] = True
+    for start, end in _outages(raw, system):
+        note(
+            "every reading is repeated, then jumps: no sensor answered; these rows' readings were set aside",
+            f"{raw.origin}: {raw.place(start)}, and {end - start - 1} rows after it",
+        )
+        bad[start:end] = True
     return with_usable(raw, np.repeat(~bad[:, None], len(raw.measured), 1), system) if bad.any() else raw
 
 
@@ -109,6 +117,29 @@ def _stuck(state: NDArray[np.float64], values: NDArray[np.float64]) -> Iterator[
             continue
         if steps[end - 1] > max(least, STUCK_RATIO * steps[end]):
             yield start + 1, end
+
+
+def _outages(raw: RawEpisode, system: System) -> Iterator[tuple[int, int]]:
+    """First row, and the row after the last, of each run of equal rows that is too long for rows lost one by one, and
+    to or from which a position jumps: the last readings, or zeros say, written while no sensor answers."""
+    positions = [raw.measured.index(name) for name in raw.measured if system.rate_of(name) is not None]
+    values = raw.state[:, positions]
+    steps = np.abs(np.diff(values, axis=0))
+    least = STUCK_STEPS * np.where(steps > 0, steps, np.inf).min(0, initial=np.inf)
+    repeated = np.append(False, (raw.state[1:] == raw.state[:-1]).all(1))
+    for start, end in runs((~repeated).cumsum()):
+        others = (repeated.sum() - (end - start - 1) + 1) / len(values)
+        by_chance = len(values) * others ** (end - start - 1) > OUTAGE_CHANCE
+        if end - start < STUCK_ROWS or end + 1 >= len(values) or not positions or by_chance:
+            continue
+        elsewhere = start > 1 and _jumps(steps[start - 2 : start][::-1], least)  # as zeros are
+        if elsewhere or _jumps(steps[end - 1 : end + 1], least):
+            yield start + (start > 0 and not elsewhere), end
+
+
+def _jumps(steps: NDArray[np.float64], least: NDArray[np.float64]) -> bool:
+    """Whether the first of two changes (2, n) of positions is larger than `least` (n,) and than the second allows."""
+    return bool((steps[0] > np.maximum(least, STUCK_RATIO * steps[1])).any())
 
 
 def jumps(raw: RawEpisode, system: System, note: Note) -> list[int]:
