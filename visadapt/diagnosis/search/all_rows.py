@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
+from visadapt.diagnosis.search.fitted_models import ScoredModel
 from visadapt.diagnosis.search.search import MAX_EFFECTS, Search
-from visadapt.estimation.fit_states import CAREFUL, FINAL
+from visadapt.estimation.fit_states import CAREFUL, FINAL, Effects
+from visadapt.estimation.likelihood import FitState
 from visadapt.estimation.segments import Segments
 
 FINALISTS = 4  # Sets at most that are fitted to all rows
@@ -22,9 +25,14 @@ def best_on_all_rows(
     """The best set of a search, and at most `others` close to it, fitted to all rows."""
     whole = Search(search.system, rows, search.catalogue, search.source.fits, search.jobs)
     close = [each for each in search.near_best() if each.effects][: 1 + others]
-    for group, how in ((close[:1], effort), (close[1:], FINAL)):
+
+    def starts(group: Sequence[ScoredModel]) -> list[tuple[Effects, FitState]]:
         # From the states of the best set so far, which a start from the readings would first have to find.
-        whole.fit([(each.effects, replace(each.fits, state=whole.best.fits.state)) for each in group], how)
+        return [(each.effects, replace(each.fits, state=whole.best.fits.state)) for each in group]
+
+    # The states of a source that is far off are far off too: a fit from there may fall behind before it comes near.
+    whole.fit(starts(close[:1]), effort, to_the_end=True)
+    whole.fit(starts(close[1:]), FINAL)
     whole.exchange_in_rejected()
     return whole
 

@@ -190,14 +190,20 @@ class FittedModels:
         return out
 
     def fit(
-        self, starts: Sequence[tuple[Effects, FitState]], effort: tuple[int, int], process_noise: bool = True
+        self,
+        starts: Sequence[tuple[Effects, FitState]],
+        effort: tuple[int, int],
+        process_noise: bool = True,
+        to_the_end: bool = False,
     ) -> list[ScoredModel]:
         """Fit sets of effects, each from a start; return the best fit so far of each. `effort`: QUICK, CAREFUL, FINAL.
 
-        Without process noise, a fit reaches parameters that explain all, if there are any, from afar.
+        Without process noise, a fit reaches parameters that explain all, if there are any, from afar. With it, a fit
+        that cannot come near the likeliest set stops early, unless it is to go on `to_the_end`.
         """
         rival = max((float(each.fits.likelihood[0]) for each in self.fitted.values()), default=self._rival)
-        out = self._fits(starts, effort, rival if process_noise else -math.inf, process_noise)
+        stops = process_noise and not to_the_end
+        out = self._fits(starts, effort, rival if stops else -math.inf, process_noise)
         return [self._keep(effects, fits) for (effects, _), fits in zip(starts, out, strict=True)]
 
     def _fits(
