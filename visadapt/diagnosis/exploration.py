@@ -13,6 +13,7 @@ from visadapt.diagnosis.search.causes import Alternative, alternatives
 from visadapt.diagnosis.search.changing import Changing, changing
 from visadapt.diagnosis.search.coloured import colour_left_by, with_coloured_noise
 from visadapt.diagnosis.search.draft import PreparedRecording
+from visadapt.diagnosis.search.earlier_commands import without_rows_on_earlier_commands
 from visadapt.diagnosis.search.fitted_models import MIN_LEFTOVER
 from visadapt.diagnosis.search.jumps import with_jumps
 from visadapt.diagnosis.search.model_comparison import ModelComparison, compare
@@ -21,7 +22,8 @@ from visadapt.diagnosis.search.repeated_causes import repeated_reading_causes
 from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.search.searched_effects import searched
 from visadapt.effects import Effect
-from visadapt.progress import Report, staged
+from visadapt.estimation.segments import Segments
+from visadapt.progress import Progress, Report, staged
 from visadapt.recordings import Recording
 from visadapt.systems import System
 
@@ -38,6 +40,16 @@ class Explored:
     repeats: list[tuple[Cause, float]]  # causes of repeated readings, and the log likelihood lost without them
     apart: tuple[ExplainedAlone, ...]  # recordings that are explained one by one, and not together
     changes: tuple[Changing, ...]  # what explains everything if it changes within the recording, the likeliest first
+
+
+@dataclass(frozen=True)
+class _Searched:
+    """A recording that was searched for sets of effects, with white noise."""
+
+    prepared: PreparedRecording
+    some_rows: Search  # of the rows searched
+    search: Search  # of all rows
+    comparison: ModelComparison
 
 
 def explore(
@@ -58,27 +70,28 @@ def explore(
         jobs, progress, announce: as `diagnose` takes them.
     """
     candidates = searched(effects, system)
-    prepared = prepare(recording, system, candidates, pushes)
-    rows = prepared.rows
-    searched_in = search = Search(system, rows.select(prepared.searched), candidates, prepared.source, jobs)
-    if announce is not None:
-        announce(duration.announcement(rows, len(effects), duration.expected(search, rows), jobs))
-    jumping = with_jumps(search)
-    if jumping is not None:
-        search, rows = jumping, replace(rows, jumps=True)
-    if jumping is not None and colour_left_by(search, search.best) is not None:
-        # A machine that resonates: its larger sets are looked for with coloured noise alone.
-        search = best_on_all_rows(search, rows)
-    else:
-        search.run(staged(progress, "search beside pushes" if pushes else "search"))
-        search = on_all_rows(search, rows)
-    comparison = compare(search)
+    kind = "search beside pushes" if pushes else "search"
+
+    def search_in(recording: Recording, announce: Callable[[str], object] | None) -> _Searched:
+        prepared = prepare(recording, system, candidates, pushes)
+        some = Search(system, prepared.rows.select(prepared.searched), candidates, prepared.source, jobs)
+        if announce is not None:
+            announce(duration.announcement(prepared.rows, len(effects), duration.expected(some, prepared.rows), jobs))
+        whole = _on_all_rows(some, prepared.rows, staged(progress, kind))
+        return _Searched(prepared, some, whole, compare(whole))
+
+    found = search_in(recording, announce)
+    shorter = without_rows_on_earlier_commands(recording, found.search, found.comparison)
+    if shorter is not None:
+        found = search_in(shorter[0], None)
+        found = replace(found, prepared=replace(found.prepared, warnings=(*found.prepared.warnings, shorter[1])))
+    prepared, search, comparison = found.prepared, found.search, found.comparison
     repeats = repeated_reading_causes(prepared, search, comparison, repeating)
     apart: tuple[ExplainedAlone, ...] = ()
     changes: tuple[Changing, ...] = ()
-    if comparison.leftover > MIN_LEFTOVER and not comparison.negligible and jumping is None:
-        apart = explained_apart(searched_in, candidates, recording.sources, progress)
-        changes = () if apart else changing(searched_in, recording.sources)
+    if comparison.leftover > MIN_LEFTOVER and not comparison.negligible and not search.rows.jumps:
+        apart = explained_apart(found.some_rows, candidates, recording.sources, progress)
+        changes = () if apart else changing(found.some_rows, recording.sources)
     if not apart and not changes:
         again = staged(progress, "search with coloured noise")
         search, comparison = with_coloured_noise(search, comparison, prepared.searched, again)
@@ -87,3 +100,18 @@ def explore(
     named = [in_use.get(effect.name, effect) for effect in effects]
     groups = alternatives(comparison, named, system)
     return Explored(named, prepared, search, comparison, groups, repeats, apart, changes)
+
+
+def _on_all_rows(search: Search, rows: Segments, progress: Progress | None) -> Search:
+    """A search that has not begun, run and continued on all `rows`; with jumps of the velocities as process noise,
+    where these explain more."""
+    jumping = with_jumps(search)
+    if jumping is None:
+        search.run(progress)
+        return on_all_rows(search, rows)
+    rows = replace(rows, jumps=True)
+    if colour_left_by(jumping, jumping.best) is not None:
+        # A machine that resonates: its larger sets are looked for with coloured noise alone.
+        return best_on_all_rows(jumping, rows)
+    jumping.run(progress)
+    return on_all_rows(jumping, rows)

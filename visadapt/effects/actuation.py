@@ -16,8 +16,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from visadapt.effects.base import ActuationEffect, Parameter, Role
+from visadapt.effects.base import ActuationEffect, Effect, Parameter, Role
 from visadapt.effects.recurrence import linear_recurrence
+from visadapt.systems import System
 from visadapt.systems.integrators import Duration
 
 __all__ = [
@@ -246,3 +247,11 @@ class ActuatorLag(ActuationEffect):
         before = torch.cat((memory, after[:, :-1]), 1)
         # The mean of command + (before - command) exp(-t / time_constant) over the substep.
         return commands + (before - commands) * ratio * -(-rate).expm1(), after[:, -1:]
+
+
+def follows_late(effect: type[Effect], system: System) -> bool:
+    """Whether a motor under the effect follows its commands late: what acts depends on earlier ones."""
+    if not issubclass(effect, ActuationEffect):
+        return False
+    one = effect(**{parameter.name: 0.0 for parameter in effect.table})
+    return one.memory(torch.zeros(1, 1, len(system.actions)), 1.0).numel() > 0

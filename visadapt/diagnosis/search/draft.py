@@ -89,9 +89,9 @@ class Readings:
         return [int(rows.any(1).int().argmax()) for rows in self.usable]
 
     def whole(self, convention: Convention | None) -> Recording:
-        """Episodes from their first usable row on, in the signs of the source. Repeated and missing readings are filled
-        in; rows of longer runs of these are marked as not usable. Rows between the readings of a sensor slower than the
-        rows are left out: a command is its mean until the next row."""
+        """Whole episodes, in the signs of the source. Repeated and missing readings are filled in; rows of longer runs
+        of these, and those before the first usable row, are marked as not usable. Rows between the readings of a sensor
+        slower than the rows are left out: a command is its mean until the next row."""
         convention = convention or Convention("", ())
         sign = sign_conventions.signs(convention.columns, self.channels)
         command_sign = sign_conventions.signs(convention.commands, range(len(self.system.actions)))
@@ -99,15 +99,15 @@ class Readings:
         slowest = None if float(share.min()) > LEAST_READ else int(share.argmin())
         parts = zip(self.stamps, self.commands, self.states, self.repeats.used, strict=True)
         episodes, usable = [], []
-        for rows, first in zip(parts, self.first_usable, strict=True):
-            time, command, state, used = (values[first:] for values in rows)
+        for (time, command, state, used), first in zip(parts, self.first_usable, strict=True):
             action, filled = command_sign * command, sign * smoothly_filled(state, used, time)
             kept = _without_long_runs((used > 0).all(1).numpy())
+            kept[:first] = False
             read = None if slowest is None else used[:, slowest].nonzero()[:, 0]
             if read is not None and len(read) > 1:
                 means = [means_until_next(time[read].numpy(), time.numpy(), each) for each in action.T.numpy()]
                 time, action, filled = time[read], torch.from_numpy(np.column_stack(means)), filled[read]
-                kept = np.ones(len(read), bool)
+                kept = read.numpy() >= first
             episodes.append(Episode(time.numpy(), action.numpy(), filled.numpy()))
             usable.append(np.repeat(kept[:, None], len(self.channels), 1))
         whole = replace(self.recording, episodes=tuple(episodes), usable=tuple(usable))

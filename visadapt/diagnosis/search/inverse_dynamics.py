@@ -109,13 +109,17 @@ class Motion:
         return (backward - forward).clamp(min=0) / 2
 
 
-def motion_of(episode: Episode, world: World, measured: Sequence[int], period: float) -> Motion | None:
-    """The motion of an episode of readings of the columns `measured`; None of one that is too short."""
+def motion_of(
+    episode: Episode, world: World, measured: Sequence[int], period: float, rows: slice = slice(None)
+) -> Motion | None:
+    """The motion in these rows of an episode of readings of the columns `measured`; None of too few rows."""
     stamps, readings, given = (
         torch.as_tensor(values, dtype=torch.float64) for values in (episode.time, episode.state, episode.action)
     )
     smoothing = max(SMOOTHING * world.system.prediction_time, period)
-    stamps = stamps.contiguous()
+    held = torch.cat((stamps.diff(), stamps.new_tensor([period])))
+    acts = world.actuate(given[None], held[None])[0].mean(1)  # of earlier commands too
+    stamps, readings, held, acts = (values[rows].contiguous() for values in (stamps, readings, held, acts))
     time = torch.arange(float(stamps[0]), float(stamps[-1]), period, dtype=torch.float64)
     if len(time) * period < SHORTEST * smoothing:
         return None
@@ -124,8 +128,7 @@ def motion_of(episode: Episode, world: World, measured: Sequence[int], period: f
     share = (time - stamps[after - 1]) / (stamps[after] - stamps[after - 1])
     for k, column in enumerate(measured):
         state[:, column] = torch.lerp(readings[after - 1, k], readings[after, k], share)
-    held = torch.cat((stamps.diff(), stamps.new_tensor([period])))
-    acting = _mean_commands(world.actuate(given[None], held[None])[0].mean(1), stamps, held, time, period)
+    acting = _mean_commands(acts, stamps, held, time, period)
     motion = Motion(world, period, smoothing, time, state, acting, torch.zeros(0))
     read = [velocity if position is None else position for position, velocity in world.system.coordinates]
     once = motion.smooth(state[:, read], 0.1)

@@ -16,6 +16,7 @@ from itertools import combinations
 
 from visadapt.diagnosis.search.fitted_models import MIN_BETTER, FittedModels, ScoredModel, key_of, less
 from visadapt.effects import ActuationEffect, Effect
+from visadapt.effects.actuation import follows_late
 from visadapt.effects.late_sensors import LateSensors, MeasurementDelay
 from visadapt.estimation.episode_phases import has_episode_phases, with_episode_phases
 from visadapt.estimation.fit_states import CAREFUL, QUICK, Effects, neutral, with_effect
@@ -37,6 +38,8 @@ and a constant load do the same."""
 TWO_FOR_ONE_UP_TO = 4
 """Effects at most in a set of which two are exchanged for one. Larger sets describe something that no effect explains;
 their many pairs would take most of the search."""
+
+MAX_ROUNDS = 3  # In which the best set is exchanged for one that has as many effects, or more
 
 LEADERS = 4  # Sets that are fitted before the others, where some fall far behind
 
@@ -228,14 +231,16 @@ class Search(FittedModels):
         return self._fit_from_quiet(starts, QUICK)
 
     def _settle(self, exchanged: Exchanges) -> None:
-        """Exchange, remove and fit carefully until the best set stays the best; no exchange is made again, and those
-        that are made are added to `exchanged`."""
-        for _ in range(3):
+        """Exchange, remove and fit carefully until the best set stays the best, or has changed MAX_ROUNDS times without
+        losing effects; no exchange is made again, and those that are made are added to `exchanged`."""
+        rounds = 0
+        while rounds < MAX_ROUNDS:
             before = self.best
             self._fit_neighbours(before, exchanged)
             self._polish()
             if self.best.names == before.names:
                 return
+            rounds += len(self.best.effects) >= len(before.effects)
 
     def _phases_of_episodes(self) -> None:
         """Where something is unexplained, try periodic effects with a phase for each episode; keep them if they win."""
@@ -304,7 +309,7 @@ class Search(FittedModels):
             if key_of(kept) in exchanged:
                 continue
             exchanged.add(key_of(kept))
-            if any(_is_slow(effect) for effect in removed):
+            if any(follows_late(effect, self.system) for effect in removed):
                 slow.append((kept, fits))
             rest = [e for e in self.catalogue if e not in centre.effects]
             screened = screen(self.system, kept, fits, self.rows, rest, self.jobs)
@@ -361,8 +366,3 @@ def _imitates(one: ScoredModel, other: ScoredModel) -> bool:
 
 def _is_delay(effect: type[Effect]) -> bool:
     return [parameter.name for parameter in effect.table] == ["delay"]
-
-
-def _is_slow(effect: type[Effect]) -> bool:
-    """Whether a motor under the effect follows its commands late: it depends on earlier ones."""
-    return issubclass(effect, ActuationEffect) and effect.memory is not ActuationEffect.memory

@@ -12,14 +12,13 @@ from itertools import pairwise
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import pad
 
 from visadapt.diagnosis.search.inverse_dynamics import GAUSSIAN_REACH, Motion, motion_of, smoothed
 from visadapt.diagnosis.search.load_columns import SLOW, columns_of
 from visadapt.diagnosis.search.unexplained import SmoothFunction
-from visadapt.recordings import Episode, Recording
+from visadapt.recordings import Recording
 from visadapt.recordings.runs import runs
 from visadapt.systems import System
 from visadapt.world import World
@@ -95,8 +94,9 @@ def load_tracks(recording: Recording, worlds: Sequence[World], known: SmoothFunc
     found = [
         part
         for number, episode in enumerate(recording.episodes)
-        for stretch in _measured(episode, recording.usable[number] if recording.usable else None)
-        for part in _track(number, stretch, worlds[number], measured, recording.period, known)
+        for rows in _measured(recording, number)
+        if (motion := motion_of(episode, worlds[number], measured, recording.period, rows)) is not None
+        for part in _track(number, motion, known)
     ]
     if not found:
         return []
@@ -153,28 +153,19 @@ def _usual_size(load: Tensor) -> Tensor:
     return usual.sqrt()
 
 
-def _measured(episode: Episode, usable: NDArray[np.bool_] | None) -> Iterator[Episode]:
-    """The stretches of an episode whose readings (T, m) are `usable`; None: the whole episode."""
-    if usable is None or usable.all():
-        yield episode
+def _measured(recording: Recording, number: int) -> Iterator[slice]:
+    """The stretches of an episode whose readings are usable."""
+    if not recording.usable:
+        yield slice(None)
         return
-    whole = np.logical_and.reduce(usable, axis=1)
+    whole = np.logical_and.reduce(recording.usable[number], axis=1)
     for start, end in runs(whole):
         if whole[start] and end - start > 1:
-            yield episode.part(slice(start, end))
+            yield slice(start, end)
 
 
-def _track(
-    number: int,
-    episode: Episode,
-    world: World,
-    measured: Sequence[int],
-    period: float,
-    known: SmoothFunction | None,
-) -> list[LoadTrack]:
-    motion = motion_of(episode, world, measured, period)
-    if motion is None:
-        return []
+def _track(number: int, motion: Motion, known: SmoothFunction | None) -> list[LoadTrack]:
+    world, period = motion.world, motion.period
     found = columns_of(motion, known)
     fastest = torch.tensor([world.system.states[v].largest for v in motion.velocities], dtype=torch.float64)
     velocity = motion.state[:, motion.velocities]

@@ -1,0 +1,108 @@
+"""Recordings that begin while motors still act on commands from before: those of a part of a longer run.
+
+What a delay, a lag or play makes of the first commands depends on those before, which no row has; they count as 0.
+Where they were not, the first rows contradict the others, and a gust or a push seems to act beside such an effect. So
+where fewer parameters explain everything without these rows, they are left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from visadapt.diagnosis.search.fitted_models import ScoredModel, key_of, less
+from visadapt.diagnosis.search.model_comparison import ModelComparison
+from visadapt.diagnosis.search.search import Search
+from visadapt.diagnosis.words import listed, number, plain
+from visadapt.effects.actuation import follows_late
+from visadapt.estimation.candidate import CandidateModel
+from visadapt.estimation.fit_states import CAREFUL
+from visadapt.estimation.likelihood import differentiate
+from visadapt.recordings import Recording
+
+FORGOTTEN = 0.005  # Share of a command's range, up to which what acts may still depend on earlier commands
+
+LONG = 1e4  # s for which a command is held before the recording, so that every motor follows it
+
+CONTRADICTS = 10.0
+"""Log likelihood by which parameters that fit the later rows must be less likely on all rows, for the first rows to
+contradict them."""
+
+MOST_LEFT_OUT = 0.5  # Share of an episode's rows
+
+
+def without_rows_on_earlier_commands(
+    recording: Recording, search: Search, comparison: ModelComparison
+) -> tuple[Recording, str] | None:
+    """The recording without the first rows of its episodes, in which the best set of effects acts on commands from
+    before, and a warning that says so, if fewer parameters explain the others or these alone are explained; else None.
+    """
+    best = comparison.best
+    late = [effect for effect in best.effects if follows_late(effect, search.system)]
+    explained = search.explains_all(best)
+    if not late or search.rows.jumps or (explained and len(late) == len(best.effects)):
+        return None
+    firsts = _first_on_own_commands(search, best)
+    found = _explaining_later_rows(search, best, firsts)
+    if found is None or (explained and found.fits.theta.shape[1] >= best.fits.theta.shape[1]):
+        return None
+    late = [effect for effect in found.effects if follows_late(effect, search.system)]
+    usable, left_out = [], 0.0
+    for index, (episode, first) in enumerate(zip(recording.episodes, firsts.tolist(), strict=True)):
+        read = recording.usable[index] if recording.usable else [True]
+        rows = np.broadcast_to(read, (len(episode.time), len(recording.measured))).copy()
+        first = min(first, int(MOST_LEFT_OUT * len(rows)))
+        rows[:first] = False
+        usable.append(rows)
+        left_out = max(left_out, float(episode.time[first] - episode.time[0]))
+    told = (
+        f"the first {number(left_out, 2)} s of each episode are left out: there the "
+        f"{listed([plain(effect.name) for effect in late])} still acts on commands from before"
+    )
+    return replace(recording, usable=tuple(usable)), told
+
+
+def _first_on_own_commands(search: Search, found: ScoredModel) -> Tensor:
+    """(E,) the first row of each episode from which on what acts depends on the recorded commands alone."""
+    rows, actions = search.rows, search.system.actions
+    world = CandidateModel(search.system, found.effects, rows).at(found.fits.theta[0])
+    bounds = rows.command.new_tensor([[action.low, action.high] for action in actions]).T
+    held = pad(rows.held, (1, 0), value=LONG)
+    low, high = (
+        world.actuate(torch.cat((before.expand(len(held), 1, -1), rows.command), 1), held)[:, 1:] for before in bounds
+    )
+    depends = ((high - low).abs().amax(2) > FORGOTTEN * (bounds[1] - bounds[0])).any(2)
+    return (depends * torch.arange(1, depends.shape[1] + 1)).amax(1)
+
+
+def _explaining_later_rows(search: Search, best: ScoredModel, firsts: Tensor) -> ScoredModel | None:
+    """The best set of effects on the rows from the first of each episode on, if it explains these, and the rows before
+    contradict them or are what `best` does not explain."""
+    rows = search.rows
+    used = rows.used * (rows.index >= firsts[rows.episode][:, None])[..., None]
+    kept = used.flatten(1).any(1).nonzero()[:, 0]
+    if not len(kept):
+        return None
+    later = Search(search.system, replace(rows, used=used).select(kept), search.catalogue, jobs=search.jobs)
+    others = [effect for effect in best.effects if not follows_late(effect, search.system)]
+    starts = [less(best, removed) for removed in ([], *([effect] for effect in others), others)]
+    later.fit([(effects, fits.on(kept)) for effects, fits in starts], CAREFUL)
+    if search.explains_all(best) or not later.explains_all(later.best):
+        if not _contradicts(search, best, later.fitted[key_of(best.effects)]):
+            return None
+        later.go_on_from([], exchange=True)
+    return later.best if later.explains_all(later.best) else None
+
+
+def _contradicts(search: Search, best: ScoredModel, later: ScoredModel) -> bool:
+    """Whether parameters that fit later rows are much less likely on all rows than those that fit all."""
+    model = CandidateModel(search.system, best.effects, search.rows)
+    all_rows, later_rows = (
+        float(differentiate([model], replace(best.fits, theta=each.fits.theta)).likelihood.sum())
+        for each in (best, later)
+    )
+    return all_rows - later_rows > CONTRADICTS
