@@ -52,10 +52,14 @@ class Tank(System):
         return ((4.5e-5 * command[:, 0] + load[:, 0] - outflow) / self.area)[:, None]
 
 
-def recorded(system, period, first, control, rows, noise, episodes=2):
-    """Recordings of a machine under `control` (row, state, generator) -> commands, integrated in steps of a 40th of the
-    period."""
-    world, generator, out = World(system, (), period, substeps=40), torch.Generator().manual_seed(0), []
+def recorded(system, period, first, control, rows, noise, episodes=2, effects=()):
+    """Recordings of a machine with `effects` under `control` (row, state, generator) -> commands, integrated in steps of
+    a 40th of the period."""
+    world, generator, out = (
+        World(system, effects, period, substeps=40).requires_grad_(False),
+        torch.Generator().manual_seed(0),
+        [],
+    )
     for _ in range(episodes):
         at = world.start(torch.tensor([first], dtype=torch.float64))
         states, actions = [], []
@@ -129,3 +133,38 @@ def test_only_a_fast_motion_is_integrated_in_shorter_steps():
 
     assert longest(0.1) == float("inf")
     assert longest(5.0) < 0.011
+
+
+@dataclass(frozen=True)
+class Winding(System):
+    """A motor whose current follows the voltage within a few rows."""
+
+    inertia: float | torch.Tensor = 5e-4  # kg m2
+    constant: float | torch.Tensor = 0.06  # N m/A
+    resistance: float | torch.Tensor = 1.5  # ohm
+    inductance: float | torch.Tensor = 0.03  # H
+
+    name = "winding"
+    states: ClassVar[tuple[Variable, ...]] = (Variable("speed", "rad/s", -250, 250), Variable("current", "A", -10, 10))
+    actions: ClassVar[tuple[Variable, ...]] = (Variable("voltage", "V", -12.0, 12.0),)
+    loads: ClassVar[tuple[Variable, ...]] = (Variable("shaft", "N m", -0.4, 0.4),)
+    coordinates = ((None, 0),)
+
+    def derivative(self, state, command, load):
+        speed, current = state.unbind(-1)
+        turns = (self.constant * current + load[:, 0]) / self.inertia
+        drop = self.resistance * current + self.constant * speed
+        return torch.stack((turns, (command[:, 0] - drop) / self.inductance), -1)
+
+
+def steps_of_voltage(row, state, generator):
+    return (8.0 * np.sign(np.sin(0.9 * (row // 16) ** 2 + 0.5)) * (0.3 + 0.7 * ((row // 16) % 5) / 4),)
+
+
+def test_a_lag_of_two_rows_is_found_as_exactly_as_longer_ones():
+    """With the mean of what acts over whole rows, it came out 1.2 % short."""
+    lag = {effect.name: effect for effect in va.catalogue(Winding())}["voltage.actuator_lag"]
+    episodes = recorded(Winding(), 0.005, [0.0, 0.0], steps_of_voltage, 500, [0.2, 0.03], 1, [lag(time_constant=0.01)])
+    recording = va.Recording(tuple(episodes), ("speed", "current"), 0.005, ("run.csv",))
+    found = va.diagnose(recording, va.World(Winding(), period=0.005), [lag])
+    assert abs(found.causes[0].parameters["time_constant"].value - 0.01) < 5e-5

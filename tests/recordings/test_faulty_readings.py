@@ -61,3 +61,23 @@ def test_a_hit_is_no_jump_of_the_sensor(file, run):
     x = moved(ROWS, 0.02)
     x[100:] += 0.02 * 5.0 * np.arange(100)  # at 5 m/s from one row to the next
     assert len(load(write(file, with_x(run, x)), columns={"x_dot": ""}).episodes) == 1
+
+
+@pytest.mark.parametrize("written", ["zeros", "the last readings"])
+def test_what_is_written_while_no_sensor_answers_is_set_aside(file, run, written):
+    columns = {name: np.array(run[name]) for name in ("x", "x_dot", "theta", "theta_dot")}
+    for values in columns.values():
+        values[80:120] = 0.0 if written == "zeros" else values[79]
+    recording = load(write(file, {**run, **columns}))
+    (usable,) = (read.all(1) for read in recording.usable)
+    assert np.flatnonzero(~usable).tolist() == list(range(80, 120))
+    (said,) = (one for one in recording.warnings if "no sensor answered" in one)
+    assert said.startswith(f"{file}: row 81 (line 82), and 39 rows after it: every reading is repeated, then jumps")
+
+
+@pytest.mark.parametrize("rate", [0.05, 0.3, 0.6])
+def test_rows_that_are_lost_one_by_one_are_no_outage(file, run, rate):
+    lost = np.random.default_rng(0).random(ROWS) < rate
+    rows = np.maximum.accumulate(np.where(lost, 0, np.arange(ROWS)))
+    kept = {name: np.array(values)[rows] for name, values in run.items() if name not in ("time", "command")}
+    assert not load(write(file, {**run, **kept})).usable
