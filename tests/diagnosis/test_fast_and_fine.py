@@ -53,8 +53,8 @@ class Tank(System):
 
 
 def recorded(system, period, first, control, rows, noise, episodes=2, effects=()):
-    """Recordings of a machine with `effects` under `control` (row, state, generator) -> commands, integrated in steps of
-    a 40th of the period."""
+    """Recordings of a machine with `effects` under `control` (row, state, generator) -> commands, integrated in steps
+    of a 40th of the period."""
     world, generator, out = (
         World(system, effects, period, substeps=40).requires_grad_(False),
         torch.Generator().manual_seed(0),

@@ -1,13 +1,17 @@
 """A long recording counts as a whole: every row sharpens what is said, and the time it takes is said before."""
 
 import re
+from dataclasses import replace
 
 import pytest
 import torch
 
 from tests.diagnosed import record
 from visadapt import diagnose
+from visadapt.diagnosis.search.fitted_models import FittedModels
+from visadapt.diagnosis.search.preparation import prepare
 from visadapt.effects import ConstantForce, PeriodicForce, ViscousFriction
+from visadapt.estimation.fit_states import CAREFUL, with_effect
 from visadapt.systems import CartPole
 from visadapt.world import World
 
@@ -68,3 +72,17 @@ def test_the_phases_of_episodes_that_were_not_searched_are_found_too():
     assert [cause.effect for cause in result.causes] == ["periodic_force"]
     assert result.causes[0].parameters["amplitude"].value == pytest.approx(1.5, rel=0.03)
     assert result.gap.closed == pytest.approx(1.0, abs=0.05)
+
+
+def test_the_fit_of_the_best_set_to_all_rows_is_not_given_up_on_its_way():
+    """From the states of a source that is far off it falls behind: a steady wind was then a periodic one."""
+    rows = prepare(record([ViscousFriction(coefficient=COEFFICIENT)]), CartPole()).rows
+    models = FittedModels(CartPole(), rows, CATALOGUE, rival=1e6)
+    start = [((ViscousFriction,), with_effect(models.source.fits, [9.0]))]
+    models.fitted[frozenset()] = replace(
+        models.source, fits=replace(models.source.fits, likelihood=torch.tensor([1e6]))
+    )
+    (given_up,) = models.fit(start, CAREFUL)
+    assert float(given_up.fits.theta) != pytest.approx(COEFFICIENT, rel=0.1)
+    (found,) = models.fit(start, CAREFUL, to_the_end=True)
+    assert float(found.fits.theta) == pytest.approx(COEFFICIENT, rel=0.1)
