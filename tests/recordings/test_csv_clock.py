@@ -31,6 +31,13 @@ class TestClock:
         assert recording.episodes[0].time[0] == 0
         np.testing.assert_allclose(np.diff(recording.episodes[0].time), recording.period)
 
+    def test_so_are_those_in_single_precision(self, file):
+        table = a_table(rows=200, period=0.0203)
+        table["time"] = (1e5 + table["time"]).astype(np.float32).astype(float)  # in steps of 1/128 s
+        recording = load(write(file, table))
+        assert recording.period == pytest.approx(0.0203, rel=1e-3)
+        assert recording.warnings == ()
+
     def test_equal_stalls_are_treated_alike_whatever_their_rounding(self, file):
         table = a_table(rows=100)
         table["time"] = 0.05 * np.arange(100) + 0.1 * (np.arange(100)[:, None] >= range(10, 94, 12)).sum(1)

@@ -25,8 +25,8 @@ AROUND = 5
 followed by others that are not. It is the median of AROUND rows on either side."""
 MOST_GAPS = 0.05
 """Share of gaps among the steps above which a clock is irregular; below it, rows are missing."""
-MOST_DECIMALS = 6
-"""Decimals up to which stamps in s may be rounded; a float32 of an hour has about as many."""
+MOST_DECIMALS, MOST_HALVINGS = 6, 20
+"""Decimals, or halvings of a second, up to which stamps may be rounded; a float32 of an hour has about as many."""
 UNSTEADY_PERIODS = 0.1
 """Difference between the longest and the shortest step, in periods, above which a clock is reported as unsteady."""
 LONGEST_STEP_PERIODS = 3.0
@@ -255,11 +255,14 @@ def _clocked(part: RawEpisode) -> RawEpisode:
 
 
 def _rounding(time: NDArray[np.float64]) -> float:
-    """The power of ten, in s, that all stamps (T,) are rounded to."""
+    """The power of ten, or of two as in single precision, in s, that all stamps (T,) are rounded to."""
     for decimals in range(MOST_DECIMALS):
         ticks = time * 10**decimals
         if np.abs(ticks - np.round(ticks)).max() < 0.01:
             return float(10**-decimals)
+    for halvings in range(MOST_HALVINGS):
+        if (np.ldexp(time, halvings) % 1 == 0).all():
+            return float(2**-halvings)
     return float(10**-MOST_DECIMALS)
 
 

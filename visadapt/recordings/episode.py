@@ -65,7 +65,10 @@ class Episode:
                 raise RecordingError(f"{name} is of type {values.dtype}; {right} is right")
             bad = ~np.isfinite(values.reshape(rows, -1)).all(1)
             if bad.any():
-                raise RecordingError(f"{name} is not finite in row {int(bad.argmax())} of {rows}")
+                raise RecordingError(
+                    f"{name} is not finite in row {int(bad.argmax())} of {rows}; finite numbers are right (a cell "
+                    "of a table may be empty)"
+                )
         backwards = np.diff(self.time) <= 0
         if backwards.any():
             raise RecordingError(f"the clock does not run forward after row {int(backwards.argmax())}")
