@@ -14,8 +14,8 @@ from tests.own_systems import DoublePendulum, Motor
 from visadapt.diagnosis import diagnose
 from visadapt.diagnosis.search.preparation import prepare
 from visadapt.diagnosis.search.pushes import pushes
-from visadapt.diagnosis.search.unexplained_load import unread_states
-from visadapt.effects import ActuatorSaturation, CoulombFriction, DynamicsEffect
+from visadapt.diagnosis.search.unexplained_load import load_tracks, unread_states
+from visadapt.effects import ActuatorLag, ActuatorSaturation, CoulombFriction, DynamicsEffect
 from visadapt.effects.catalogue import catalogue
 from visadapt.recordings import Episode, Recording
 from visadapt.systems import CartPole
@@ -334,3 +334,15 @@ def test_of_a_short_push_the_impulse_is_said_and_no_effect_is_named(effect, load
     for push in found.where.pushes:
         assert push.ci90[0] < impulse < push.ci90[1]
         assert push.impulse == pytest.approx(impulse, rel=0.2)
+
+
+def test_a_lagging_motor_goes_on_through_rows_that_were_not_read():
+    """From rest, what acts after them was 10 N off."""
+    lag = ActuatorLag(time_constant=0.2)
+    recording = record([lag], episodes=1, rows=200, noise=(0, 0, 0, 0))
+    read = np.ones((200, 2), bool)
+    read[90:100] = False
+    tracks = load_tracks(dataclasses.replace(recording, usable=(read,)), [World(CartPole(), [lag]).double()])
+    assert len(tracks) == 2
+    for track in tracks:
+        assert float((track.load * track.unit)[:, 0].abs().max()) < 1.0  # N
