@@ -44,7 +44,7 @@ def test_nothing_is_named_beside_what_acts(effects):
         for name, one in cause.parameters.items():
             np.testing.assert_allclose(one.value, float(getattr(true, name)), rtol=0.03)
     (said,) = (warning for warning in found.warnings if LEFT_OUT in warning)
-    assert said.startswith("the first 0.")
+    assert said.startswith("up to the first 0.")
 
 
 def test_a_run_from_its_start_keeps_all_rows():

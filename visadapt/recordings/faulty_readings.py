@@ -32,7 +32,8 @@ STUCK_RATIO, STUCK_STEPS = 3.0, 8
 """Change of a position after its sensor stuck, over the next change and over the smallest of all, at least: a machine
 that dry friction held starts slowly instead."""
 OUTAGE_CHANCE = 1e-3
-"""Probability, up to which the rows of an episode that are lost one by one would repeat one as often somewhere."""
+"""Probability that rows which are lost one by one repeat one as often somewhere in an episode, up to which a run of
+equal rows is an outage."""
 JUMP_SCALES = 12.0
 """Departure of a change from those around it, over the median departure, from which on a position may have jumped."""
 JUMP_RATIO, AROUND_JUMP = 2.0, 5
@@ -120,21 +121,27 @@ def _stuck(state: NDArray[np.float64], values: NDArray[np.float64]) -> Iterator[
 
 
 def _outages(raw: RawEpisode, system: System) -> Iterator[tuple[int, int]]:
-    """First row, and the row after the last, of each run of equal rows that is too long for rows lost one by one, and
-    to or from which a position jumps: the last readings, or zeros say, written while no sensor answers."""
+    """First row, and the row after the last, of each run of equal rows that were written while no sensor answered: too
+    many for rows lost one by one, and zeros to or from which a position jumps, or the last readings of a machine that
+    moved, from which one jumps."""
     positions = [raw.measured.index(name) for name in raw.measured if system.rate_of(name) is not None]
+    # An angle that stands still in places is an effect of the catalogue.
+    if not positions or (len(raw.measured) == 1 and variable_of(system, raw.measured[0]).unit == "rad"):
+        return
     values = raw.state[:, positions]
     steps = np.abs(np.diff(values, axis=0))
     least = STUCK_STEPS * np.where(steps > 0, steps, np.inf).min(0, initial=np.inf)
     repeated = np.append(False, (raw.state[1:] == raw.state[:-1]).all(1))
     for start, end in runs((~repeated).cumsum()):
         others = (repeated.sum() - (end - start - 1) + 1) / len(values)
-        by_chance = len(values) * others ** (end - start - 1) > OUTAGE_CHANCE
-        if end - start < STUCK_ROWS or end + 1 >= len(values) or not positions or by_chance:
+        if end - start < STUCK_ROWS or len(values) * others ** (end - start - 1) > OUTAGE_CHANCE:
             continue
-        elsewhere = start > 1 and _jumps(steps[start - 2 : start][::-1], least)  # as zeros are
-        if elsewhere or _jumps(steps[end - 1 : end + 1], least):
-            yield start + (start > 0 and not elsewhere), end
+        leaves = end + 1 < len(values) and _jumps(steps[end - 1 : end + 1], least)
+        if (raw.state[start] == 0).all():
+            if leaves or (start > 1 and _jumps(steps[start - 2 : start][::-1], least)):
+                yield start, end
+        elif leaves and start > 0 and (steps[start - 1] > least).any():
+            yield start + 1, end
 
 
 def _jumps(steps: NDArray[np.float64], least: NDArray[np.float64]) -> bool:

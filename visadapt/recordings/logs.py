@@ -211,25 +211,32 @@ class _Log:
             note(f"{early.sum()} rows before the first message of {last_to_begin} are left out", str(self.path))
         if late.any():
             note(f"{late.sum()} rows after the last message of {first_to_end} are left out", str(self.path))
-        parts = [(self.slowest, rows)]
+        parts, every = [(self.slowest, rows)], time[rows]
         for name in self.apart:
             stamps = self.topics[name].time
-            own = np.flatnonzero((stamps >= time[rows[0]]) & (stamps <= time[rows[-1]]))
-            if len(own) < 2:
+            known = self._known(name) & (stamps >= time[rows[0]]) & (stamps <= time[rows[-1]])
+            for action in self.of_actions:
+                known &= ~in_gaps(stamps, self.topics[action].time)
+            if known.sum() < 2:
                 raise RecordingError(f"{self.path}: {name} and {self.slowest} have no time in common")
+            own = np.flatnonzero(known & ~np.isin(stamps, every))  # a row has the readings of all with its stamp
             parts.append((name, own))
-        every = np.concatenate([self.topics[name].time[own] for name, own in parts])
-        of = np.concatenate(
-            [np.column_stack([np.full_like(own, self.of_states.index(name)), own]) for name, own in parts]
-        )
-        first = np.sort(np.unique(every, return_index=True)[1])  # one row where two topics have the same stamp
-        order = first[np.argsort(every[first])]
+            every = np.concatenate((every, stamps[own]))
+        topic = np.concatenate([np.full_like(own, self.of_states.index(name)) for name, own in parts])
+        of = np.column_stack((topic, np.concatenate([own for _, own in parts])))
+        order = np.argsort(every, kind="stable")
         return _Rows(every[order], of[order])
+
+    def _known(self, topic: str) -> NDArray[np.bool_]:
+        """In which messages (N,) of a topic all of its measured states are finite."""
+        names = [name for name in self.measured if self.columns[name][0] == topic]
+        known: NDArray[np.bool_] = np.isfinite(np.column_stack([self.values(name) for name in names])).all(1)
+        return known
 
     def read_in(self, rows: _Rows) -> NDArray[np.bool_]:
         """Which measured states are read in which rows (T, n_measured)."""
         by_topic = {
-            name: np.isin(rows.time, self.topics[name].time)
+            name: np.isin(rows.time, self.topics[name].time[self._known(name)])
             if name in self.apart
             else rows.of[:, 0] == self.of_states.index(self.slowest)
             for name in self.of_states
@@ -238,16 +245,18 @@ class _Log:
 
     def state(self, name: str, time: NDArray[np.float64]) -> NDArray[np.float64]:
         """A measured state at these times (T,): as read then, or interpolated."""
-        topic, values = self.columns[name][0], self.values(name)
+        topic = self.columns[name][0]
+        known = self._known(topic) if topic in self.apart else np.ones(len(self.topics[topic].time), bool)
+        values = self.values(name)[known]
         attitude = self.system.states[ATTITUDE] if isinstance(self.system, RigidBody) else ()
         quaternion = [state.name for state in attitude]
         if name in quaternion:
             together = [each for each in quaternion if each in self.columns and self.columns[each][0] == topic]
-            whole = np.column_stack([self.values(each) for each in together])
+            whole = np.column_stack([self.values(each)[known] for each in together])
             values = continuous_quaternion(torch.from_numpy(whole)).numpy()[:, together.index(name)]
         if self.system.states[self.system.index(name)].unit == "rad":
             values = np.unwrap(values)
-        return np.interp(time, self.topics[topic].time, values)
+        return np.interp(time, self.topics[topic].time[known], values)
 
     def command(self, name: str, time: NDArray[np.float64]) -> NDArray[np.floating]:
         """The command of an action in rows with these stamps (T,)."""

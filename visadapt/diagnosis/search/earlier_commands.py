@@ -1,8 +1,9 @@
 """Recordings that begin while motors still act on commands from before: those of a part of a longer run.
 
 What a delay, a lag or play makes of the first commands depends on those before, which no row has; they count as 0.
-Where they were not, the first rows contradict the others, and a gust or a push seems to act beside such an effect. So
-where fewer parameters explain everything without these rows, they are left out.
+Where those were not 0, the first rows contradict the others, and a gust or a push seems to act beside such an effect.
+So these rows are left out where fewer parameters explain the others, and with them the first rows too, if another
+command was given before.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from visadapt.diagnosis.search.fitted_models import ScoredModel, key_of, less
+from visadapt.diagnosis.search.fitted_models import FittedModels, ScoredModel, key_of, less
 from visadapt.diagnosis.search.model_comparison import ModelComparison
 from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.words import listed, number, plain
@@ -22,6 +23,7 @@ from visadapt.effects.actuation import follows_late
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.fit_states import CAREFUL
 from visadapt.estimation.likelihood import differentiate
+from visadapt.estimation.segments import Segments
 from visadapt.recordings import Recording
 
 FORGOTTEN = 0.005  # Share of a command's range, up to which what acts may still depend on earlier commands
@@ -32,7 +34,10 @@ CONTRADICTS = 10.0
 """Log likelihood by which parameters that fit the later rows must be less likely on all rows, for the first rows to
 contradict them."""
 
-MOST_LEFT_OUT = 0.5  # Share of an episode's rows
+MOST_LEFT_OUT = 0.6  # Share of an episode's rows
+
+ROUNDS, TRIED = 7, 5
+"""Rounds in which the command before each episode is found, in half as large a range each, and how many are tried."""
 
 
 def without_rows_on_earlier_commands(
@@ -47,20 +52,22 @@ def without_rows_on_earlier_commands(
     if not late or search.rows.jumps or (explained and len(late) == len(best.effects)):
         return None
     firsts = _first_on_own_commands(search, best)
-    found = _explaining_later_rows(search, best, firsts)
+    rows = torch.tensor([len(episode.time) for episode in recording.episodes])
+    if bool((firsts > MOST_LEFT_OUT * rows).any()):
+        return None
+    found = _explaining(search, best, firsts)
     if found is None or (explained and found.fits.theta.shape[1] >= best.fits.theta.shape[1]):
         return None
     late = [effect for effect in found.effects if follows_late(effect, search.system)]
     usable, left_out = [], 0.0
     for index, (episode, first) in enumerate(zip(recording.episodes, firsts.tolist(), strict=True)):
         read = recording.usable[index] if recording.usable else [True]
-        rows = np.broadcast_to(read, (len(episode.time), len(recording.measured))).copy()
-        first = min(first, int(MOST_LEFT_OUT * len(rows)))
-        rows[:first] = False
-        usable.append(rows)
+        own = np.broadcast_to(read, (len(episode.time), len(recording.measured))).copy()
+        own[:first] = False
+        usable.append(own)
         left_out = max(left_out, float(episode.time[first] - episode.time[0]))
     told = (
-        f"the first {number(left_out, 2)} s of each episode are left out: there the "
+        f"up to the first {number(left_out, 2)} s of each episode are left out: there the "
         f"{listed([plain(effect.name) for effect in late])} still acts on commands from before"
     )
     return replace(recording, usable=tuple(usable)), told
@@ -79,9 +86,9 @@ def _first_on_own_commands(search: Search, found: ScoredModel) -> Tensor:
     return (depends * torch.arange(1, depends.shape[1] + 1)).amax(1)
 
 
-def _explaining_later_rows(search: Search, best: ScoredModel, firsts: Tensor) -> ScoredModel | None:
-    """The best set of effects on the rows from the first of each episode on, if it explains these, and the rows before
-    contradict them or are what `best` does not explain."""
+def _explaining(search: Search, best: ScoredModel, firsts: Tensor) -> ScoredModel | None:
+    """The best set of effects on the rows from the first of each episode on, if it explains these and, with a constant
+    command before each episode, those before too: other causes than earlier commands may act there."""
     rows = search.rows
     used = rows.used * (rows.index >= firsts[rows.episode][:, None])[..., None]
     kept = used.flatten(1).any(1).nonzero()[:, 0]
@@ -95,7 +102,8 @@ def _explaining_later_rows(search: Search, best: ScoredModel, firsts: Tensor) ->
         if not _contradicts(search, best, later.fitted[key_of(best.effects)]):
             return None
         later.go_on_from([], exchange=True)
-    return later.best if later.explains_all(later.best) else None
+    found = later.best
+    return found if later.explains_all(found) and _explains_first_rows(search, found, int(firsts.max())) else None
 
 
 def _contradicts(search: Search, best: ScoredModel, later: ScoredModel) -> bool:
@@ -106,3 +114,38 @@ def _contradicts(search: Search, best: ScoredModel, later: ScoredModel) -> bool:
         for each in (best, later)
     )
     return all_rows - later_rows > CONTRADICTS
+
+
+def _explains_first_rows(search: Search, found: ScoredModel, rows_before: int) -> bool:
+    """Whether a set explains all rows if a constant command was given for so many rows before each episode."""
+    actions = search.system.actions
+    low, high = search.rows.command.new_tensor([[action.low, action.high] for action in actions]).T
+    episodes = len(search.rows.command)
+    before, reach = (0.5 * (low + high)).expand(episodes, -1), 0.5 * (high - low)
+    for _ in range(ROUNDS):
+        for action in range(len(actions)):
+            tried = before + torch.linspace(-1, 1, TRIED)[:, None, None] * reach * torch.eye(len(actions))[action]
+            tried = tried.clamp(low, high)
+            likelihood = torch.stack([_by_episode(search, found, each, rows_before) for each in tried])
+            before = tried[likelihood.argmax(0), torch.arange(episodes)]
+        reach = 0.5 * reach
+    rows = _with_commands_before(search.rows, before, rows_before)
+    models = FittedModels(search.system, rows, search.catalogue, search.source.fits, search.jobs)
+    (fitted,) = models.fit([(found.effects, replace(search.best.fits, theta=found.fits.theta))], CAREFUL)
+    return models.explains_all(fitted)
+
+
+def _by_episode(search: Search, found: ScoredModel, before: Tensor, rows_before: int) -> Tensor:
+    """(E,) log likelihood of the episodes with commands (E, n_action) before them."""
+    rows = _with_commands_before(search.rows, before, rows_before)
+    model = CandidateModel(search.system, found.effects, rows)
+    fits = replace(search.best.fits, theta=found.fits.theta, log_process=found.fits.log_process)
+    likelihood = differentiate([model], replace(fits, log_noise=found.fits.log_noise)).likelihood[0]
+    return likelihood.new_zeros(len(before)).index_add(0, rows.episode, likelihood)
+
+
+def _with_commands_before(rows: Segments, before: Tensor, count: int) -> Segments:
+    """The same windows in episodes that begin `count` rows earlier, with constant commands (E, n_action) until then."""
+    command = torch.cat((before[:, None].expand(-1, count, -1), rows.command), 1)
+    held = pad(rows.held, (count, 0), value=rows.period)
+    return replace(rows, command=command, held=held, first=rows.first + count)
