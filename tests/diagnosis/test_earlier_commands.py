@@ -51,3 +51,9 @@ def test_a_run_from_its_start_keeps_all_rows():
     found = found_in([ActuatorLag(time_constant=0.15), ViscousFriction(coefficient=2.0)], cut=False)
     assert {cause.effect for cause in found.causes} == {"actuator_lag", "viscous_friction"}
     assert not any(LEFT_OUT in warning for warning in found.warnings)
+
+
+def test_a_gust_in_the_first_rows_stays_a_cause():
+    found = found_in([ActuatorLag(time_constant=0.15), Gust(start=0.15, end=0.35, force=8.0)], cut=False)
+    assert {cause.effect for cause in found.causes} == {"actuator_lag", "gust"}
+    assert not any(LEFT_OUT in warning for warning in found.warnings)

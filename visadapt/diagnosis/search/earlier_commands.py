@@ -36,8 +36,9 @@ contradict them."""
 
 MOST_LEFT_OUT = 0.6  # Share of an episode's rows
 
-ROUNDS, TRIED = 7, 5
-"""Rounds in which the command before each episode is found, in half as large a range each, and how many are tried."""
+TRIED = (21, 5, 5, 5, 5, 5)
+"""How many commands before each episode are tried, over its range and then between those next to the best: of play that
+is narrower than the range, most do the same."""
 
 
 def without_rows_on_earlier_commands(
@@ -122,13 +123,13 @@ def _explains_first_rows(search: Search, found: ScoredModel, rows_before: int) -
     low, high = search.rows.command.new_tensor([[action.low, action.high] for action in actions]).T
     episodes = len(search.rows.command)
     before, reach = (0.5 * (low + high)).expand(episodes, -1), 0.5 * (high - low)
-    for _ in range(ROUNDS):
+    for count in TRIED:
         for action in range(len(actions)):
-            tried = before + torch.linspace(-1, 1, TRIED)[:, None, None] * reach * torch.eye(len(actions))[action]
+            tried = before + torch.linspace(-1, 1, count)[:, None, None] * reach * torch.eye(len(actions))[action]
             tried = tried.clamp(low, high)
             likelihood = torch.stack([_by_episode(search, found, each, rows_before) for each in tried])
             before = tried[likelihood.argmax(0), torch.arange(episodes)]
-        reach = 0.5 * reach
+        reach = 2 / (count - 1) * reach
     rows = _with_commands_before(search.rows, before, rows_before)
     models = FittedModels(search.system, rows, search.catalogue, search.source.fits, search.jobs)
     (fitted,) = models.fit([(found.effects, replace(search.best.fits, theta=found.fits.theta))], CAREFUL)
