@@ -40,8 +40,8 @@ def test_readings_are_rows_and_commands_are_what_was_held_between_them(kind, tmp
 FIELDS = {"x": "/x.data", "theta": "/theta.data", "command": "/u.data"}
 
 
-def numbers(path, stamps, command=lambda time: 0.5 if time > -0.1 else np.nan):
-    """A bag of ROS 2 with a number at each of a topic's stamps, in s."""
+def numbers(path, stamps, command=lambda time: 0.5 if time > -0.1 else np.nan, unknown=()):
+    """A bag of ROS 2 with a number at each of a topic's stamps, in s; those of x at the `unknown` ones are NaN."""
     store = get_typestore(Stores.LATEST)
     number = store.types["std_msgs/msg/Float64"]
     with rosbag2.Writer(path, version=9) as writer:
@@ -50,7 +50,8 @@ def numbers(path, stamps, command=lambda time: 0.5 if time > -0.1 else np.nan):
             for time in times:
                 # The angle passes the turn at 3 rad, as an encoder's does.
                 angle = (2 * time + 3 + np.pi) % (2 * np.pi) - np.pi
-                value = {"/x": time, "/theta": angle, "/u": command(time)}[topic]
+                place = np.nan if np.isclose(time, unknown).any() else time
+                value = {"/x": place, "/theta": angle, "/u": command(time)}[topic]
                 raw = store.serialize_cdr(number(value), "std_msgs/msg/Float64")
                 writer.write(connection, int(1e9 * (START + time)), raw)
     return path
@@ -80,6 +81,15 @@ def test_a_topic_that_is_much_slower_has_rows_of_its_own(tmp_path):
         episode.state[x, 0] - episode.time[x], episode.state[x, 0][0] - episode.time[x][0], atol=1e-6
     )
     np.testing.assert_allclose(np.diff(episode.state[angle, 1]), 0.04, atol=1e-6)
+
+
+def test_a_slow_topic_s_unknown_numbers_cost_no_rows_of_the_others(tmp_path):
+    stamps = {"/x": np.arange(0.003, 6, 0.2), "/theta": np.arange(0, 6, 0.02), "/u": np.arange(0, 6, 0.05)}
+    path = numbers(tmp_path / "run", stamps, unknown=(1.003, 1.203, 3.403))
+    (usable,) = load_recording(path, CartPole(), FIELDS).usable
+    x, angle = usable.T
+    assert x.sum() == 27
+    assert angle.sum() == len(stamps["/theta"])
 
 
 def test_fields_in_other_units_are_converted_before_they_are_interpolated(tmp_path):

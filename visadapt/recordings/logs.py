@@ -230,8 +230,7 @@ class _Log:
     def _known(self, topic: str) -> NDArray[np.bool_]:
         """In which messages (N,) of a topic all of its measured states are finite."""
         names = [name for name in self.measured if self.columns[name][0] == topic]
-        known: NDArray[np.bool_] = np.isfinite(np.column_stack([self.values(name) for name in names])).all(1)
-        return known
+        return np.isfinite(np.column_stack([self.values(name) for name in names]).sum(1))
 
     def read_in(self, rows: _Rows) -> NDArray[np.bool_]:
         """Which measured states are read in which rows (T, n_measured)."""

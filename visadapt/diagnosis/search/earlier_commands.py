@@ -2,8 +2,8 @@
 
 What a delay, a lag or play makes of the first commands depends on those before, which no row has; they count as 0.
 Where those were not 0, the first rows contradict the others, and a gust or a push seems to act beside such an effect.
-So these rows are left out where fewer parameters explain the others, and with them the first rows too, if another
-command was given before.
+So these rows are left out where fewer parameters explain the others, and would explain the first rows too, had another
+command been given before.
 """
 
 from __future__ import annotations
@@ -44,9 +44,9 @@ is narrower than the range, most do the same."""
 def without_rows_on_earlier_commands(
     recording: Recording, search: Search, comparison: ModelComparison
 ) -> tuple[Recording, str] | None:
-    """The recording without the first rows of its episodes, in which the best set of effects acts on commands from
-    before, and a warning that says so, if fewer parameters explain the others or these alone are explained; else None.
-    """
+    """The recording without the first rows of its episodes, and a warning that says so: those in which the best set of
+    effects acts on commands from before, if fewer parameters explain the others, or nothing explains these rows; else
+    None."""
     best = comparison.best
     late = [effect for effect in best.effects if follows_late(effect, search.system)]
     explained = search.explains_all(best)
@@ -89,7 +89,7 @@ def _first_on_own_commands(search: Search, found: ScoredModel) -> Tensor:
 
 def _explaining(search: Search, best: ScoredModel, firsts: Tensor) -> ScoredModel | None:
     """The best set of effects on the rows from the first of each episode on, if it explains these and, with a constant
-    command before each episode, those before too: other causes than earlier commands may act there."""
+    command before each episode, the rows before them too: else something other than earlier commands acts there."""
     rows = search.rows
     used = rows.used * (rows.index >= firsts[rows.episode][:, None])[..., None]
     kept = used.flatten(1).any(1).nonzero()[:, 0]
