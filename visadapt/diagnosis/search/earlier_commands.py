@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from visadapt.diagnosis.search.fitted_models import FittedModels, ScoredModel, key_of, less
+from visadapt.diagnosis.search.fitted_models import FittedModels, ScoredModel, less
 from visadapt.diagnosis.search.model_comparison import ModelComparison
 from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.words import listed, number, plain
@@ -97,10 +97,14 @@ def _explaining(search: Search, best: ScoredModel, firsts: Tensor) -> ScoredMode
         return None
     later = Search(search.system, replace(rows, used=used).select(kept), search.catalogue, jobs=search.jobs)
     others = [effect for effect in best.effects if not follows_late(effect, search.system)]
-    starts = [less(best, removed) for removed in ([], *([effect] for effect in others), others)]
-    later.fit([(effects, fits.on(kept)) for effects, fits in starts], CAREFUL)
-    if search.explains_all(best) or not later.explains_all(later.best):
-        if not _contradicts(search, best, later.fitted[key_of(best.effects)]):
+    (whole,) = later.fit([(best.effects, best.fits.on(kept))], CAREFUL)
+    explained, contradicts = search.explains_all(best), _contradicts(search, best, whole)
+    if explained and not contradicts:
+        return None
+    fewer = [less(best, removed) for removed in (*([effect] for effect in others), others)]
+    later.fit([(effects, fits.on(kept)) for effects, fits in fewer], CAREFUL)
+    if explained or not later.explains_all(later.best):
+        if not contradicts:
             return None
         later.go_on_from([], exchange=True)
     found = later.best
