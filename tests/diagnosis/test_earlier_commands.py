@@ -14,7 +14,7 @@ from visadapt.world import World
 
 CATALOGUE = [ActuatorLag, ActuatorBacklash, ViscousFriction, Gust]
 SKIPPED = 20
-LEFT_OUT = "still acts on commands from before"
+LEFT_OUT = "still depend on commands from before"
 
 
 def later(recording):

@@ -68,8 +68,8 @@ def without_rows_on_earlier_commands(
         usable.append(own)
         left_out = max(left_out, float(episode.time[first] - episode.time[0]))
     told = (
-        f"up to the first {number(left_out, 2)} s of each episode are left out: there the "
-        f"{listed([plain(effect.name) for effect in late])} still acts on commands from before"
+        f"up to the first {number(left_out, 2)} s of each episode are left out: they still depend on commands from "
+        f"before, by {listed([plain(effect.name) for effect in late])}"
     )
     return replace(recording, usable=tuple(usable)), told
 
