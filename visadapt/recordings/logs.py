@@ -186,8 +186,7 @@ class _Log:
         return replace(self, topics=topics)
 
     def rows(self, note: Note) -> _Rows:
-        """The messages of the topic that gives the rows for which all others have a value, and those between them of
-        topics that are much slower."""
+        """The messages of the topic that gives the rows where the others have a value, and those of slower topics."""
         topics = (*self.together, *self.of_actions)
         begins = {name: self.topics[name].time[0] for name in topics}
         ends = {name: self.topics[name].time[-1] for name in self.together}
@@ -211,10 +210,15 @@ class _Log:
             note(f"{early.sum()} rows before the first message of {last_to_begin} are left out", str(self.path))
         if late.any():
             note(f"{late.sum()} rows after the last message of {first_to_end} are left out", str(self.path))
-        parts, every = [(self.slowest, rows)], time[rows]
+        return self._with_slower(rows)
+
+    def _with_slower(self, rows: NDArray[np.intp]) -> _Rows:
+        """These messages of the topic that gives the rows, and those between them of topics that are much slower."""
+        time = self.topics[self.slowest].time[rows]
+        parts, every = [(self.slowest, rows)], time
         for name in self.apart:
             stamps = self.topics[name].time
-            known = self._known(name) & (stamps >= time[rows[0]]) & (stamps <= time[rows[-1]])
+            known = self._known(name) & (stamps >= time[0]) & (stamps <= time[-1])
             for action in self.of_actions:
                 known &= ~in_gaps(stamps, self.topics[action].time)
             if known.sum() < 2:
