@@ -81,7 +81,7 @@ def explore(
         return _Searched(prepared, some, whole, compare(whole))
 
     found = search_in(recording, announce)
-    shorter = without_rows_on_earlier_commands(recording, found.search, found.comparison)
+    shorter = without_rows_on_earlier_commands(recording, found.search, found.comparison.best)
     if shorter is not None:
         found = search_in(shorter[0], None)
         found = replace(found, prepared=replace(found.prepared, warnings=(*found.prepared.warnings, shorter[1])))

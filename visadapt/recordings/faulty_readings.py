@@ -110,13 +110,12 @@ def _outliers(steps: NDArray[np.float64], values: NDArray[np.float64], allowed: 
 def _stuck(state: NDArray[np.float64], values: NDArray[np.float64]) -> Iterator[tuple[int, int]]:
     """First row, and the row after the last, of each run in which a sensor of `values` (T,), one of those of `state`
     (T, n_measured), repeats an earlier one."""
-    steps = np.abs(np.diff(values))
-    least = STUCK_STEPS * float(steps[steps > 0].min(initial=np.inf))
+    steps, least = _steps(values)
     for start, end in runs(values):
         lost = (state[start:end] == state[start]).all()  # whole rows, which are an effect of the catalogue
         if end - start < STUCK_ROWS or end + 1 >= len(values) or lost:
             continue
-        if steps[end - 1] > max(least, STUCK_RATIO * steps[end]):
+        if _jumps(steps[end - 1 : end + 1], least):
             yield start + 1, end
 
 
@@ -128,15 +127,13 @@ def _outages(raw: RawEpisode, system: System) -> Iterator[tuple[int, int]]:
     # An angle that stands still in places is an effect of the catalogue.
     if not positions or (len(raw.measured) == 1 and variable_of(system, raw.measured[0]).unit == "rad"):
         return
-    values = raw.state[:, positions]
-    steps = np.abs(np.diff(values, axis=0))
-    least = STUCK_STEPS * np.where(steps > 0, steps, np.inf).min(0, initial=np.inf)
+    steps, least = _steps(raw.state[:, positions])
     repeated = np.append(False, (raw.state[1:] == raw.state[:-1]).all(1))
     for start, end in runs((~repeated).cumsum()):
-        others = (repeated.sum() - (end - start - 1) + 1) / len(values)
-        if end - start < STUCK_ROWS or len(values) * others ** (end - start - 1) > OUTAGE_CHANCE:
+        others = (repeated.sum() - (end - start - 1) + 1) / len(repeated)
+        if end - start < STUCK_ROWS or len(repeated) * others ** (end - start - 1) > OUTAGE_CHANCE:
             continue
-        leaves = end + 1 < len(values) and _jumps(steps[end - 1 : end + 1], least)
+        leaves = end + 1 < len(repeated) and _jumps(steps[end - 1 : end + 1], least)
         if (raw.state[start] == 0).all():
             if leaves or (start > 1 and _jumps(steps[start - 2 : start][::-1], least)):
                 yield start, end
@@ -144,8 +141,14 @@ def _outages(raw: RawEpisode, system: System) -> Iterator[tuple[int, int]]:
             yield start + 1, end
 
 
+def _steps(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Sizes (T - 1, ...) of the changes of positions (T, ...), and the least (...) from which on one may be a jump."""
+    steps = np.abs(np.diff(values, axis=0))
+    return steps, STUCK_STEPS * np.where(steps > 0, steps, np.inf).min(0, initial=np.inf)
+
+
 def _jumps(steps: NDArray[np.float64], least: NDArray[np.float64]) -> bool:
-    """Whether the first of two changes (2, n) of positions is larger than `least` (n,) and than the second allows."""
+    """Whether the first of two changes (2, ...) of positions exceeds `least` (...) and what the second allows."""
     return bool((steps[0] > np.maximum(least, STUCK_RATIO * steps[1])).any())
 
 

@@ -16,7 +16,6 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from visadapt.diagnosis.search.fitted_models import FittedModels, ScoredModel, less
-from visadapt.diagnosis.search.model_comparison import ModelComparison
 from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.words import listed, number, plain
 from visadapt.effects.actuation import follows_late
@@ -42,12 +41,11 @@ is narrower than the range, most do the same."""
 
 
 def without_rows_on_earlier_commands(
-    recording: Recording, search: Search, comparison: ModelComparison
+    recording: Recording, search: Search, best: ScoredModel
 ) -> tuple[Recording, str] | None:
     """The recording without the first rows of its episodes, and a warning that says so: those in which the best set of
     effects acts on commands from before, if fewer parameters explain the others, or nothing explains these rows; else
     None."""
-    best = comparison.best
     late = [effect for effect in best.effects if follows_late(effect, search.system)]
     explained = search.explains_all(best)
     if not late or search.rows.jumps or (explained and len(late) == len(best.effects)):
@@ -129,7 +127,7 @@ def _explains_first_rows(search: Search, found: ScoredModel, rows_before: int) -
     before, reach = (0.5 * (low + high)).expand(episodes, -1), 0.5 * (high - low)
     for count in TRIED:
         for action in range(len(actions)):
-            tried = before + torch.linspace(-1, 1, count)[:, None, None] * reach * torch.eye(len(actions))[action]
+            tried = before + torch.linspace(-1, 1, count)[:, None, None] * torch.diag(reach)[action]
             tried = tried.clamp(low, high)
             likelihood = torch.stack([_by_episode(search, found, each, rows_before) for each in tried])
             before = tried[likelihood.argmax(0), torch.arange(episodes)]

@@ -109,17 +109,18 @@ class Motion:
         return (backward - forward).clamp(min=0) / 2
 
 
-def motion_of(
-    episode: Episode, world: World, measured: Sequence[int], period: float, rows: slice = slice(None)
-) -> Motion | None:
-    """The motion in these rows of an episode of readings of the columns `measured`; None of too few rows."""
-    stamps, readings, given = (
-        torch.as_tensor(values, dtype=torch.float64) for values in (episode.time, episode.state, episode.action)
-    )
+def acting_in(episode: Episode, world: World, period: float) -> Tensor:
+    """(T, n_action) what acts after each row of an episode from its start on, the mean until the next row."""
+    stamps, given = (torch.as_tensor(values, dtype=torch.float64) for values in (episode.time, episode.action))
+    return world.actuate(given[None], _held(stamps, period)[None])[0].mean(1)
+
+
+def motion_of(episode: Episode, acts: Tensor, world: World, measured: Sequence[int], period: float) -> Motion | None:
+    """The motion of an episode, or a part of one, of readings of the columns `measured`, under what `acts`
+    (T, n_action) in its rows; None of one that is too short."""
+    stamps, readings = (torch.as_tensor(values, dtype=torch.float64) for values in (episode.time, episode.state))
     smoothing = max(SMOOTHING * world.system.prediction_time, period)
-    held = torch.cat((stamps.diff(), stamps.new_tensor([period])))
-    acts = world.actuate(given[None], held[None])[0].mean(1)  # of earlier commands too
-    stamps, readings, held, acts = (values[rows].contiguous() for values in (stamps, readings, held, acts))
+    stamps = stamps.contiguous()
     time = torch.arange(float(stamps[0]), float(stamps[-1]), period, dtype=torch.float64)
     if len(time) * period < SHORTEST * smoothing:
         return None
@@ -128,7 +129,7 @@ def motion_of(
     share = (time - stamps[after - 1]) / (stamps[after] - stamps[after - 1])
     for k, column in enumerate(measured):
         state[:, column] = torch.lerp(readings[after - 1, k], readings[after, k], share)
-    acting = _mean_commands(acts, stamps, held, time, period)
+    acting = _mean_commands(acts, stamps, _held(stamps, period), time, period)
     motion = Motion(world, period, smoothing, time, state, acting, torch.zeros(0))
     read = [velocity if position is None else position for position, velocity in world.system.coordinates]
     once = motion.smooth(state[:, read], 0.1)
@@ -138,6 +139,11 @@ def motion_of(
         if position is not None:
             state[:, velocity] = motion.rate(state[:, position])
     return replace(motion, measured=motion.rate(state[:, motion.velocities]))
+
+
+def _held(stamps: Tensor, period: float) -> Tensor:
+    """(T,) s from each of the stamps (T,) to the next; a period after the last."""
+    return torch.cat((stamps.diff(), stamps.new_tensor([period])))
 
 
 def _mean_commands(acting: Tensor, stamps: Tensor, held: Tensor, time: Tensor, period: float) -> Tensor:

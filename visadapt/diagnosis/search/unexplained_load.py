@@ -6,7 +6,7 @@ state and command may explain (load_columns.py), smoothed alike.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -15,10 +15,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from visadapt.diagnosis.search.inverse_dynamics import GAUSSIAN_REACH, Motion, motion_of, smoothed
+from visadapt.diagnosis.search.inverse_dynamics import GAUSSIAN_REACH, Motion, acting_in, motion_of, smoothed
 from visadapt.diagnosis.search.load_columns import SLOW, columns_of
 from visadapt.diagnosis.search.unexplained import SmoothFunction
-from visadapt.recordings import Recording
+from visadapt.recordings import Episode, Recording
 from visadapt.recordings.runs import runs
 from visadapt.systems import System
 from visadapt.world import World
@@ -93,9 +93,8 @@ def load_tracks(recording: Recording, worlds: Sequence[World], known: SmoothFunc
     measured = [system.index(name) for name in recording.measured]
     found = [
         part
-        for number, episode in enumerate(recording.episodes)
-        for rows in _measured(recording, number)
-        if (motion := motion_of(episode, worlds[number], measured, recording.period, rows)) is not None
+        for number, (episode, world) in enumerate(zip(recording.episodes, worlds, strict=True))
+        for motion in _motions(episode, _measured(recording, number), world, measured, recording.period)
         for part in _track(number, motion, known)
     ]
     if not found:
@@ -141,7 +140,8 @@ def bare_motions(recording: Recording, system: System) -> list[Motion | None]:
     if not has_joints(system) or unread_states(recording, system):
         return []
     world, measured = World(system, (), recording.period).double(), [system.index(name) for name in recording.measured]
-    return [motion_of(episode, world, measured, recording.period) for episode in recording.episodes]
+    period = recording.period
+    return [motion_of(one, acting_in(one, world, period), world, measured, period) for one in recording.episodes]
 
 
 def _usual_size(load: Tensor) -> Tensor:
@@ -162,6 +162,17 @@ def _measured(recording: Recording, number: int) -> Iterator[slice]:
     for start, end in runs(whole):
         if whole[start] and end - start > 1:
             yield slice(start, end)
+
+
+def _motions(
+    episode: Episode, stretches: Iterable[slice], world: World, measured: Sequence[int], period: float
+) -> Iterator[Motion]:
+    """The motions in those stretches of an episode that are long enough."""
+    acts = acting_in(episode, world, period)  # also of the commands before a stretch
+    for rows in stretches:
+        motion = motion_of(episode.part(rows), acts[rows], world, measured, period)
+        if motion is not None:
+            yield motion
 
 
 def _track(number: int, motion: Motion, known: SmoothFunction | None) -> list[LoadTrack]:
