@@ -7,6 +7,7 @@ import numpy as np
 import torch
 
 import visadapt as va
+from tests.cylinder import Cylinder
 from tests.own_systems import DoublePendulum
 from visadapt.estimation.integration_step import with_longest_step
 from visadapt.estimation.segments import cut
@@ -168,3 +169,21 @@ def test_a_lag_of_two_rows_is_found_as_exactly_as_longer_ones():
     recording = va.Recording(tuple(episodes), ("speed", "current"), 0.005, ("run.csv",))
     found = va.diagnose(recording, va.World(Winding(), period=0.005), [lag])
     assert abs(found.causes[0].parameters["time_constant"].value - 0.01) < 5e-5
+
+
+def steps_of_a_valve(row, state, generator):
+    return (np.random.default_rng(row // 15).uniform(-0.4, 0.4),)
+
+
+def test_a_valve_that_lags_is_not_a_command_that_came_too_early():
+    """The commands came out 2.6 ms early and the lag 3 % long: sets without the lag were fitted to them as they are."""
+    words = "scale", "delay", "lag", "added"
+    catalogue = [effect for effect in va.catalogue(Cylinder()) if any(word in effect.name for word in words)]
+    lag = next(effect for effect in catalogue if effect.name == "valve.actuator_lag")
+    noise, effects = [2e-4, 3e-3, 0.02], [lag(time_constant=0.03)]
+    episodes = recorded(Cylinder(), 0.01, [0.0, 0.0, 0.0], steps_of_a_valve, 150, noise, 1, effects)
+    recording = va.Recording(tuple(episodes), ("x", "v", "p"), 0.01, ("run.csv",))
+    found = va.diagnose(recording, va.World(Cylinder(), period=0.01), catalogue)
+    assert (found.verdict, [cause.effect for cause in found.causes]) == ("identified", [lag.name])
+    assert abs(found.causes[0].parameters["time_constant"].value - 0.03) < 6e-4
+    assert not any("before the rows" in warning for warning in found.warnings)

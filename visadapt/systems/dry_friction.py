@@ -52,13 +52,14 @@ def stopped(system: System, before: Tensor, after: Tensor, command: Tensor, limi
     first, last, at_rest = before[rows], after[rows], at_rest[rows]
     loads = rubs.any(0).nonzero()[:, 0].tolist()
     acting, none = command.expand(len(rows), -1)[rows], torch.zeros_like(at_rest[..., 0])
-    _, by_load = system.of_rows(rows).rates_per_load(first, acting, none, loads)
+    here = system.of_rows(rows)
+    _, by_load = here.rates_per_load(first, acting, none, loads)
     responses = dict(zip(loads, by_load, strict=True))
     out = after.clone()
-    out[rows] = _stopped(system, first, last, responses, at_rest, at_rest, duration)
+    out[rows] = _stopped(here, first, last, acting, responses, at_rest, at_rest, duration)
     started = limits(out[:, velocities] / 2)[rows]
     if started.requires_grad or not torch.equal(started, at_rest):  # friction may depend on velocity
-        out[rows] = _stopped(system, first, last, responses, at_rest, started, duration)
+        out[rows] = _stopped(here, first, last, acting, responses, at_rest, started, duration)
     return out
 
 
@@ -66,6 +67,7 @@ def _stopped(
     system: System,
     before: Tensor,
     after: Tensor,
+    command: Tensor,
     responses: dict[int, Tensor],
     at_rest: Tensor,
     started: Tensor,
@@ -73,6 +75,7 @@ def _stopped(
 ) -> Tensor:
     """`stopped` for rows in each of which something reverses, with the limits (B, n_load, 2) on coordinates at rest and
     on those that have started, and the change (B, n_state) of all rates per unit of each load that rubs, by index."""
+    outside = system.outside_joints()
     for k, gain in responses.items():
         own = system.coordinates[k][1]
         forward, backward = at_rest[:, k].unbind(-1)
@@ -93,5 +96,14 @@ def _stopped(
         for position, velocity in system.velocity_of().items():
             moved[:, position] = moved[:, position] + 0.5 * left * h * gain[:, velocity] * impulse
         moved[:, own] = torch.where(reverses, kept, last)  # exactly at rest
+        if outside:  # what flows or is induced with the motion, as a cylinder's pressure or a motor's current
+            slower = after.index_copy(1, torch.tensor([own], device=after.device), moved[:, own : own + 1])
+            rates = _free(system, slower, command) - _free(system, after, command)
+            moved[:, outside] = moved[:, outside] + (0.5 * left * h)[:, None] * rates[:, outside]
         after = moved
     return after
+
+
+def _free(system: System, state: Tensor, command: Tensor) -> Tensor:
+    """The rates (B, n_state) of all states without a load."""
+    return system.derivative(state, command, state.new_zeros(len(state), len(system.loads)))

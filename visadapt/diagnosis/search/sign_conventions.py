@@ -13,6 +13,7 @@ from visadapt.diagnosis.search.fitted_models import ScoredModel
 from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.words import listed
 from visadapt.effects import Effect
+from visadapt.estimation.fit_states import QUICK
 from visadapt.estimation.likelihood import FitState
 from visadapt.estimation.profiles import Convention, profile_of
 from visadapt.estimation.segments import Segments
@@ -65,7 +66,7 @@ def stays_ahead(
 ) -> bool:
     """Whether a recording read in another way is likelier than as it is given, by the log likelihood that is required:
     under the source and, if it is, when effects are added to the source in both, and to sets `beside` it in the
-    other."""
+    other, and with the other's best set in both."""
     if float(other.source.fits.likelihood[0] - as_given.source.fits.likelihood[0]) <= required:
         return False
     if not other.catalogue:
@@ -80,7 +81,11 @@ def stays_ahead(
         for search in (as_given, other):
             search.extend([search.best], LEADS)
         bases = [max(other.extend([base], LEADS), key=lambda each: each.log_odds, default=base) for base in bases]
-    return _ahead(other, as_given) > required
+    if _ahead(other, as_given) <= required:
+        return False
+    # What explains the other way may explain this one as well, and not be among the leads of its own sets.
+    same = as_given.fit([(other.best.effects, other.best.fits)], QUICK) if other.best.effects else []
+    return all(_likelihood(other) - float(each.fits.likelihood[0]) > required for each in same)
 
 
 def _ahead(one: Search, other: Search) -> float:
