@@ -6,7 +6,7 @@ import torch
 import visadapt as va
 from tests.cli.commands import GUESS, refused, run, write_frames
 from visadapt import progress
-from visadapt.diagnosis import planning
+from visadapt.diagnosis import excitations, planning
 from visadapt.diagnosis.search import camera
 
 SHIPPED = va.shipped("cartpole_states")
@@ -71,8 +71,8 @@ def test_an_effect_that_is_given_replaces_that_of_the_diagnosis(here, trained, d
 def test_the_causes_of_the_gap_are_named_and_put_into_the_simulator(here, capsys, only_effects, monkeypatch):
     only_effects("constant_force", "actuator_bias", "actuator_gain", "viscous_friction", "spring", "angle_offset")
     # Three excitations of one size for the next round, for the time they take.
-    monkeypatch.setattr(planning, "CYCLES", (0.4,))
-    monkeypatch.setattr(planning, "BIT_ROWS", ())
+    monkeypatch.setattr(excitations, "CYCLES", (0.4,))
+    monkeypatch.setattr(excitations, "BIT_ROWS", ())
     monkeypatch.setattr(planning, "SIZES", (0.2,))
     policy = ("--policy", SHIPPED, "--target", "rig:states", "--diagnose")
     assert run("adapt", *policy, *SMALL) == 0

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import visadapt as va
-from visadapt.diagnosis import planning
+from visadapt.diagnosis import excitations
 from visadapt.diagnosis.result import Cause, Estimate, Gap, RecordingSummary, Where
 from visadapt.effects import catalogue as effects
 
@@ -20,8 +20,8 @@ SOURCE = va.World(va.CartPole())
 @pytest.fixture(autouse=True)
 def few_excitations(monkeypatch):
     """One frequency of six and one binary sequence of four, for the time it takes."""
-    monkeypatch.setattr(planning, "CYCLES", (0.4,))
-    monkeypatch.setattr(planning, "BIT_ROWS", (4,))
+    monkeypatch.setattr(excitations, "CYCLES", (0.4,))
+    monkeypatch.setattr(excitations, "BIT_ROWS", (4,))
 
 
 @pytest.fixture(scope="module")
@@ -114,12 +114,19 @@ def test_a_machine_without_a_policy_is_excited_about_the_commands_recorded():
     episode = va.Episode(4.0 * np.arange(60), commands[:, 0].numpy(), np.stack(levels))
     recording = va.Recording((episode,), ("level",), 4.0, ("run.csv",))
     effects.catalogue(tank)
-    found = ambiguous(("voltage.actuator_bias", "offset", -1.0), ("voltage.actuator_gain", "scale", 0.8))
-    planned = va.plan(found, recording, va.World(tank, (), 4.0), samples=40)
+    bias, gain = ("voltage.actuator_bias", "offset", -1.0), ("voltage.actuator_gain", "scale", 0.8)
+    planned = va.plan(ambiguous(bias, gain), recording, va.World(tank, (), 4.0), samples=40)
     assert 0 <= planned.added.min() < 5
     assert 7 < planned.added.max() <= 12
     assert f": command {planned.excitation}, for " in str(planned)
     assert f", about voltage {float(commands.mean()):.3g} V)" in planned.excitation
+    assert not planned.alike
+    # What does exactly the same as the first explanation does not hide what tells the others apart.
+    leak = "inflow.constant_load", "force", -1e-5
+    with_leak = va.plan(ambiguous(bias, leak, gain), recording, va.World(tank, (), 4.0), samples=40)
+    assert (with_leak.explanations, with_leak.alike) == (planned.explanations, ((leak[0],),))
+    assert with_leak.log_odds == pytest.approx(planned.log_odds, rel=0.1)
+    assert str(with_leak).endswith(f"; no excitation was found that tells it from {leak[0]}")
 
 
 def test_a_pole_that_falls_needs_the_policy(pushed):

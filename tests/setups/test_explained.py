@@ -6,7 +6,7 @@ import torch
 
 import visadapt as va
 from tests.own_systems import Pendulum
-from visadapt.diagnosis import planning
+from visadapt.diagnosis import excitations, planning
 from visadapt.diagnosis.result import SCHEMA_VERSION
 from visadapt.effects import EFFECTS
 from visadapt.recordings import read_recording
@@ -86,8 +86,8 @@ def test_a_command_of_the_opposite_sign_is_refused_where_no_episode_is_long_enou
 def test_what_two_causes_explain_is_settled_by_an_experiment_in_the_next_round(tmp_path, monkeypatch, only_effects):
     only_effects("viscous_friction", "coulomb_friction", "actuator_gain")
     # Three excitations of one size, and coarser steps of the target, for the time they take.
-    monkeypatch.setattr(planning, "CYCLES", (0.4,))
-    monkeypatch.setattr(planning, "BIT_ROWS", ())
+    monkeypatch.setattr(excitations, "CYCLES", (0.4,))
+    monkeypatch.setattr(excitations, "BIT_ROWS", ())
     monkeypatch.setattr(planning, "SIZES", (0.4,))
     monkeypatch.setattr(synthetic, "SMOOTH_STEP", 0.0125)
     effects = [va.effects.ViscousFriction(coefficient=0.3), ReadingNoise()]

@@ -41,8 +41,8 @@ def diagnose(parser: argparse.ArgumentParser) -> None:
     add(
         "--policy",
         metavar="P.safetensors",
-        help="a cart-pole's policy on states, as `visadapt train` writes it: the terms of the paper's Theorem 1 are "
-        "given for it, on the terminal and in the report, and --plan adds to its commands",
+        help="a policy on states, as `visadapt train` writes it: --plan adds to its commands, and for a cart-pole's "
+        "the terms of the paper's Theorem 1 are given, on the terminal and in the report",
     )
     add("--json", metavar="F", help="write the result here as JSON (schema: visadapt/diagnosis/schema.json)")
     add("--report", metavar="F.html", help="write a page with figures here")

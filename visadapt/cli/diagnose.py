@@ -18,7 +18,7 @@ from visadapt.diagnosis.report.text import as_text
 from visadapt.diagnosis.result import AMBIGUOUS
 from visadapt.diagnosis.words import printable
 from visadapt.effects.own import is_own
-from visadapt.policies import StatePolicy
+from visadapt.policies import Policy
 from visadapt.progress import staged
 from visadapt.recordings import Recording, load_recording
 from visadapt.setups.policy_file import load_policy
@@ -35,6 +35,11 @@ def run(options: argparse.Namespace) -> None:
     """Diagnose, print the verdict, write what was asked for."""
     system = given_system(options)
     import_effects(options)
+    if options.policy and is_own(type(system)) and not options.plan:
+        raise InputError(
+            f"--policy: its terms of Theorem 1 are those of a cartpole's policy, not of a {system.name}'s: leave it "
+            "out, or give --plan, whose excitation is added to its commands"
+        )
     policy = _state_policy(Path(options.policy), system) if options.policy else None
     if options.renderer and not isinstance(system, CartPole):
         raise InputError(f"--renderer: renderers draw a cart-pole, not a {system.name}")
@@ -47,8 +52,9 @@ def run(options: argparse.Namespace) -> None:
             _check_period(Path(options.policy), policy, recording.period)
         source = World(system, period=recording.period)
         seed, jobs = options.seed, options.jobs
+        bounded = policy if isinstance(system, CartPole) else None  # by Theorem 1
         result = diagnosis.diagnose(
-            recording, source, seed=seed, jobs=jobs, progress=report, policy=policy, announce=print, renderer=renderer
+            recording, source, seed=seed, jobs=jobs, progress=report, policy=bounded, announce=print, renderer=renderer
         )
     said = [as_text(result)]
     try:
@@ -66,7 +72,7 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _plan(
-    options: argparse.Namespace, result: Diagnosis, recording: Recording, source: World, policy: StatePolicy | None
+    options: argparse.Namespace, result: Diagnosis, recording: Recording, source: World, policy: Policy | None
 ) -> str:
     """Design and write the plan; what became of it, in a line."""
     if result.verdict != AMBIGUOUS:
@@ -98,7 +104,7 @@ def _settings(options: argparse.Namespace, system: System) -> dict[str, str]:
     return {name: printable(value) for name, value in settings.items() if value}
 
 
-def _check_period(path: Path, policy: StatePolicy, period: float) -> None:
+def _check_period(path: Path, policy: Policy, period: float) -> None:
     trained = policy.trained_in["period"] if policy.trained_in else period
     if abs(trained - period) > PERIOD_TOLERANCE * trained:
         raise InputError(
@@ -107,13 +113,9 @@ def _check_period(path: Path, policy: StatePolicy, period: float) -> None:
         )
 
 
-def _state_policy(path: Path, system: System) -> StatePolicy:
-    if is_own(type(system)):
-        raise InputError(
-            f"--policy: its terms of Theorem 1 are those of a cartpole's policy, not of a {system.name}'s: leave it out"
-        )
+def _state_policy(path: Path, system: System) -> Policy:
     policy = load_policy(path)
-    if not isinstance(policy, StatePolicy):
+    if policy.shown != "state":
         raise InputError(f"{path}: is shown the {policy.shown} of a target; a policy on states alone is needed")
     if (policy.n_state, policy.n_action) != (len(system.states), len(system.actions)):
         raise InputError(

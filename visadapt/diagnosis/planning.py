@@ -4,8 +4,9 @@ An ambiguous diagnosis names effects that fit a recording equally well. Each exp
 excitation of a family (square waves, sines, pseudo-random binary sequences, white noise; the largest that keeps all
 states within 0.9 of the system's ranges, about their middles), and every explanation is fitted to what each shows. The
 worth of an excitation is the log posterior odds of the true against the other explanation: the least over all pairs of
-the first explanation and another, with either of them true. This is the expected information of Box and Hill (1967),
-Technometrics 9(1), with fits in place of a linear model and the worst case in place of the mean.
+the first explanation and another that some excitation tells from it, with either of them true. This is the expected
+information of Box and Hill (1967), Technometrics 9(1), with fits in place of a linear model and the worst case in place
+of the mean.
 
 The odds are those of readings without noise under the recording's noise, which is what they are on average: drawn noise
 would add a few units at random, and the best of many excitations would be the luckiest.
@@ -23,6 +24,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from visadapt.diagnosis.excitations import excitations, operating_point
 from visadapt.diagnosis.explanations import explanations
 from visadapt.diagnosis.policy_bound import StatesToActions, actions
 from visadapt.diagnosis.result import AMBIGUOUS, Diagnosis, Push, named_effects
@@ -30,6 +32,7 @@ from visadapt.diagnosis.search.fitted_models import FittedModels
 from visadapt.diagnosis.search.preparation import limited, prepare
 from visadapt.diagnosis.words import number, with_unit
 from visadapt.effects import EFFECTS, Effect
+from visadapt.effects.catalogue import twins
 from visadapt.estimation.fit_states import CAREFUL, QUICK, with_effect
 from visadapt.estimation.likelihood import FitState
 from visadapt.history import History
@@ -40,8 +43,6 @@ from visadapt.storage.atomic_files import replacing
 from visadapt.systems import System
 from visadapt.world import World
 
-CYCLES = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6)  # In a prediction time, of square waves and sines
-BIT_ROWS = (1, 2, 4, 8)  # Rows of a bit of a pseudo-random binary sequence
 SIZES = (0.05, 0.1, 0.14, 0.2, 0.28, 0.4, 0.57, 0.8)
 """Amplitudes that are tried, and the standard deviation of white noise, as shares of half the command's range."""
 MARGIN = 0.9
@@ -62,7 +63,7 @@ class Plan:
     """
 
     explanations: tuple[tuple[str, ...], ...]
-    """names of the effects of each; the first is told apart from the others"""
+    """names of the effects of each; the first is told apart from the others, where any excitation does that"""
     excitation: str
     """in words"""
     time: NDArray[np.floating]
@@ -77,6 +78,8 @@ class Plan:
     """the same for white noise of the largest admissible size; NaN where none is admissible"""
     is_all: bool = False
     """whether `added` is all of the commands: no policy was given"""
+    alike: tuple[tuple[str, ...], ...] = ()
+    """names of the effects of each explanation that no excitation tells from the first, where some tell others"""
 
     @property
     def settles(self) -> bool:
@@ -84,14 +87,15 @@ class Plan:
         return self.log_odds > WORTH
 
     def __str__(self) -> str:
-        sets = [" and ".join(names) for names in self.explanations]
+        first, others = " and ".join(self.explanations[0]), _either(self.explanations[1:])
         if not self.settles:
-            return f"no excitation was found that tells {sets[0]} from {' or '.join(sets[1:])}"
+            return f"no excitation was found that tells {first} from {others}"
         white = "" if math.isnan(self.white) else f"; {self.white:.0f} for white noise"
         what = f"command {self.excitation}" if self.is_all else f"add {self.excitation} to the commands"
+        alike = f"; no excitation was found that tells it from {_either(self.alike)}" if self.alike else ""
         return (
-            f"to tell {sets[0]} from {' or '.join(sets[1:])}: {what}, for {self.time[-1]:.3g} s (expected log odds "
-            f"{self.log_odds:.0f}{white})"
+            f"to tell {first} from {others}: {what}, for {self.time[-1]:.3g} s (expected log odds "
+            f"{self.log_odds:.0f}{white}){alike}"
         )
 
     def write(self, path: str | Path) -> None:
@@ -146,11 +150,16 @@ def plan(
     sets = _explained(found)
     generator = torch.Generator().manual_seed(seed)
     trials = _Trials.of(sets, recording, found.where.pushes, source.system, policy, samples, generator)
-    worth = trials.worth(sets, progress)
+    by_rival = trials.worth(sets, progress)
+    # Of rivals that do exactly the same under every excitation, none would be worth anything against all.
+    told = by_rival.nan_to_num(-math.inf).amax(0) > WORTH
+    worth = by_rival[:, told if bool(told.any()) else slice(None)].amin(1)
     best = int(worth.nan_to_num(-math.inf).argmax())
     white = [k for k, name in enumerate(trials.names) if name.startswith("white")]
+    names = [tuple(effect.name for effect in each) for each in sets]
+    apart = [each for each, is_told in zip(names[1:], told.tolist(), strict=True) if is_told] or names[1:]
     return Plan(
-        explanations=tuple(tuple(effect.name for effect in each) for each in sets),
+        explanations=(names[0], *apart),
         excitation=f"{trials.names[best]} ({SIZES[int(trials.largest[best])]:g} of half the range{trials.about})",
         time=recording.period * np.arange(samples),
         added=trials.added[trials.row(best)].numpy(),
@@ -158,6 +167,7 @@ def plan(
         log_odds=float(worth[best]),
         white=_highest(worth[white]),
         is_all=policy is None,
+        alike=tuple(each for each in names[1:] if each not in apart),
     )
 
 
@@ -192,9 +202,9 @@ class _Trials:
             ValueError: the machine leaves the ranges of its states under every excitation.
         """
         noise, start, measured = _noise_and_start(sets[0], recording, system, pushes)
-        names, unit = _excitations(system, recording.period, samples, generator)
+        names, unit = excitations(system, recording.period, samples, generator)
         sizes = torch.tensor(SIZES, dtype=unit.dtype)[:, None, None, None]
-        constant = _operating_point(recording, system) if policy is None else torch.zeros_like(unit[0, 0])
+        constant = operating_point(recording, system) if policy is None else torch.zeros_like(unit[0, 0])
         added = (constant + sizes * unit).flatten(0, 1)
         added = system.within_range(added) if policy is None else added
         about = "".join(
@@ -215,20 +225,44 @@ class _Trials:
         return int(self.largest[excitation]) * len(self.names) + excitation
 
     def worth(self, sets: Sequence[Sequence[Effect]], progress: Progress | None) -> Tensor:
-        """Log odds (E,) of the true against the other explanation, in the worst case; NaN where no size is admitted."""
-        worth = torch.full((len(self.names),), math.nan)
+        """Log odds (E, sets - 1) of the true against the other of two explanations, the first and each of the others,
+        whichever is true; NaN where no size is admitted."""
+        worth = torch.full((len(self.names), len(sets)), math.nan)
+        # Explanations that do exactly the same as an earlier one need no fits.
+        like = [
+            next(k for k in range(len(sets)) if k == n or _same(sets[k], sets[n], self.system))
+            for n in range(len(sets))
+        ]
         for done, k in enumerate(torch.nonzero(self.largest >= 0)[:, 0].tolist()):
             row = self.row(k)
             runs = [(states[row], commands[row]) for states, commands in self.shown]
             recordings = [_recording(self.recording, self.system, self.measured, *run, self.noise) for run in runs]
-            worth[k] = min(
-                _lead(sets[truth], sets[other], recordings[truth], self.system)
-                for rival in range(1, len(sets))
-                for truth, other in ((0, rival), (rival, 0))
-            )
+            worth[k, 0] = 0.0
+            for rival in range(1, len(sets)):
+                worth[k, rival] = (
+                    min(
+                        _lead(sets[truth], sets[other], recordings[truth], self.system)
+                        for truth, other in ((0, rival), (rival, 0))
+                    )
+                    if like[rival] == rival
+                    else worth[k, like[rival]]
+                )
             if progress is not None:
-                progress(done + 1, len(self.names), float(worth.nan_to_num(-math.inf).max()))
-        return worth
+                progress(done + 1, len(self.names), float(worth[:, 1:].nan_to_num(-math.inf).max()))
+        return worth[:, 1:]
+
+
+def _same(one: Sequence[Effect], other: Sequence[Effect], system: System) -> bool:
+    """Whether two explanations differ in one effect each, and no motion tells these two apart."""
+    ours, theirs = ({type(effect) for effect in each} for each in (one, other))
+    if len(ours - theirs) != 1 or len(theirs - ours) != 1:
+        return False
+    [effect] = ours - theirs
+    return bool(twins(effect, theirs - ours, system))
+
+
+def _either(sets: Sequence[Sequence[str]]) -> str:
+    return " or ".join(" and ".join(names) for names in sets)
 
 
 def _highest(values: Tensor) -> float:
@@ -267,39 +301,6 @@ def _noise_and_start(
     noise = torch.zeros(len(system.states), dtype=torch.float64)
     noise[list(prepared.rows.channels)] = (fits.log_noise[0] / 2).exp()
     return noise, fits.state[0, 0, 0], prepared.rows.channels
-
-
-def _operating_point(recording: Recording, system: System) -> Tensor:
-    """(n_action,) commands about which a machine without a policy is excited: 0 or, where that is not inside a
-    command's range, the mean of those recorded."""
-    mean = np.concatenate([episode.action for episode in recording.episodes]).mean(0)
-    inside = np.array([action.low < 0 < action.high for action in system.actions])
-    return torch.from_numpy(np.where(inside, 0.0, mean)).double()
-
-
-def _excitations(system: System, period: float, samples: int, generator: torch.Generator) -> tuple[list[str], Tensor]:
-    """Excitations of one command each, in words, and their values (N, samples, n_action) for a size of 1 (`SIZES`)."""
-    time = period * torch.arange(samples, dtype=torch.float64)
-    names, shapes = [], []
-    for k, action in enumerate(system.actions):
-        where = f" on {action.name}" if len(system.actions) > 1 else ""
-        frequencies = [cycles / system.prediction_time for cycles in CYCLES]
-        phases = {f: 2 * math.pi * f * time for f in frequencies if f * period < 0.25}
-        signals = {
-            f"a square wave of {f:g} Hz{where}": torch.where(phase.sin() >= 0, 1.0, -1.0) for f, phase in phases.items()
-        }
-        signals |= {f"a sine of {f:g} Hz{where}": phase.sin() for f, phase in phases.items()}
-        for rows in BIT_ROWS:
-            coin = torch.randint(2, (math.ceil(samples / rows),), generator=generator).to(time)
-            held = coin.repeat_interleave(rows)[:samples]
-            signals[f"a pseudo-random binary sequence with bits of {rows * period:.3g} s{where}"] = 2 * held - 1
-        signals[f"white noise{where}"] = torch.randn(samples, generator=generator, dtype=torch.float64)
-        for name, values in signals.items():
-            shape = torch.zeros(samples, len(system.actions), dtype=torch.float64)
-            shape[:, k] = values * (action.high - action.low) / 2
-            names.append(name)
-            shapes.append(shape)
-    return names, torch.stack(shapes)
 
 
 def _simulate(

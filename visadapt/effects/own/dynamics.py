@@ -10,7 +10,7 @@ from typing import Any
 from visadapt.effects import laws
 from visadapt.effects.base import Parameter, Role
 from visadapt.effects.own.added_inertia import AddedInertia, inertia_of
-from visadapt.effects.own.statement import Made, turns
+from visadapt.effects.own.statement import Made, slides, turns
 from visadapt.effects.parameters import ParameterScale
 from visadapt.systems import System, Variable
 from visadapt.systems.base import parameters
@@ -55,9 +55,6 @@ def _laws(load: Variable, position: Variable | None, velocity: Variable) -> _Law
     def linear(name: str, low: float, unit: str = unit, high: float = most) -> Parameter:
         return Parameter(name, unit, low, high, 0.0, linear=True)
 
-    def friction(*names: str) -> tuple[Parameter, ...]:
-        return tuple(Parameter(name, unit, 0.0, most, 0.0) for name in names)
-
     # A coefficient is searched up to the one with which a third of the range of motion makes the largest load.
     per_velocity = 3 * most / fastest
     by_position: _Laws = {}
@@ -91,26 +88,7 @@ def _laws(load: Variable, position: Variable | None, velocity: Variable) -> _Law
             f"Q = -coefficient |{v}| {v}",
             (linear("coefficient", 0.0, _per(load, velocity, 2), 3 * per_velocity / fastest),),
         ),
-        "coulomb_friction": (
-            laws.CoulombLaw,
-            f"Q = -{size} sign({v}); at rest, what holds the joint, up to {size}",
-            friction(size),
-        ),
-        "stribeck_friction": (
-            laws.StribeckLaw,
-            f"Q = -({size} + max(breakaway - {size}, 0) exp(-({v} / velocity)^2)) sign({v}); at rest, up to breakaway",
-            (*friction(size, "breakaway"), Parameter("velocity", velocity.unit, fastest / 500, fastest / 5, None)),
-        ),
-        "directional_friction": (
-            laws.DirectionalLaw,
-            f"Q = -forward where {v} > 0, backward where {v} < 0; at rest, what holds the joint, up to these",
-            friction("forward", "backward"),
-        ),
-        "load_dependent_friction": (
-            laws.LoadDependentLaw,
-            f"Q = -share |motor {size}| sign({v}); at rest, what holds the joint, up to share |motor {size}|",
-            (Parameter("share", "1", 0.0, 0.8, 0.0),),
-        ),
+        **(_dry_friction(size, most, unit, velocity) if slides(position, velocity) else {}),
         **by_position,
         "constant_load": (laws.ConstantLaw, f"Q = {size}", (linear(size, -most),)),
         "periodic_load": (
@@ -131,6 +109,36 @@ def _laws(load: Variable, position: Variable | None, velocity: Variable) -> _Law
                 Parameter("end", "s", 0.0, 20.0, None, role=Role.END),
                 linear(size, -most),
             ),
+        ),
+    }
+
+
+def _dry_friction(size: str, most: float, unit: str, velocity: Variable) -> _Laws:
+    v, fastest = velocity.name, velocity.largest
+
+    def friction(*names: str) -> tuple[Parameter, ...]:
+        return tuple(Parameter(name, unit, 0.0, most, 0.0) for name in names)
+
+    return {
+        "coulomb_friction": (
+            laws.CoulombLaw,
+            f"Q = -{size} sign({v}); at rest, what holds the joint, up to {size}",
+            friction(size),
+        ),
+        "stribeck_friction": (
+            laws.StribeckLaw,
+            f"Q = -({size} + max(breakaway - {size}, 0) exp(-({v} / velocity)^2)) sign({v}); at rest, up to breakaway",
+            (*friction(size, "breakaway"), Parameter("velocity", velocity.unit, fastest / 500, fastest / 5, None)),
+        ),
+        "directional_friction": (
+            laws.DirectionalLaw,
+            f"Q = -forward where {v} > 0, backward where {v} < 0; at rest, what holds the joint, up to these",
+            friction("forward", "backward"),
+        ),
+        "load_dependent_friction": (
+            laws.LoadDependentLaw,
+            f"Q = -share |motor {size}| sign({v}); at rest, what holds the joint, up to share |motor {size}|",
+            (Parameter("share", "1", 0.0, 0.8, 0.0),),
         ),
     }
 

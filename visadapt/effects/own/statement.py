@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from typing import Any
 
 from visadapt.effects.base import Effect
@@ -22,6 +23,15 @@ MIN_RANGE = 4 * math.pi
 def turns(angle: Variable) -> bool:
     """Whether a position is an angle of more than two turns."""
     return angle.unit == "rad" and angle.high - angle.low > MIN_RANGE
+
+
+SPEED = re.compile(r"([kcmu]?m|m?rad|deg|°|rev)/(s|min|h)|rpm|1/(s|min)")
+"""Units of velocities"""
+
+
+def slides(position: Variable | None, velocity: Variable) -> bool:
+    """Whether a coordinate moves, so that dry friction can hold it; a level, a temperature or a current does not."""
+    return position is not None or SPEED.fullmatch(velocity.unit) is not None
 
 
 def delay_of_all(system: type[System]) -> str:
