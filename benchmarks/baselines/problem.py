@@ -19,9 +19,9 @@ import torch
 from experiments.result_tables import Row
 from visadapt.effects import Effect, Residual
 from visadapt.effects.base import Role
+from visadapt.learning.collection import collect
 from visadapt.learning.grounding import ground, rescale
 from visadapt.learning.ledger import Ledger
-from visadapt.learning.rounds import collect
 from visadapt.learning.transitions import Transitions
 from visadapt.policies import Policy
 from visadapt.recordings import Episode

@@ -6,6 +6,7 @@ import torch
 from tests.coarse import coarse_targets
 from tests.scenes import state_residual_network
 from visadapt.effects import AngleOffset, Residual
+from visadapt.learning.collection import Kept
 from visadapt.learning.grounding import GroundSettings
 from visadapt.learning.joint import adapt
 from visadapt.learning.ledger import BudgetExceeded, Ledger
@@ -264,11 +265,13 @@ class TestLearning:
 
 class TestTargets:
     @pytest.mark.parametrize("at", [1, 5])
-    def test_one_that_returns_nan_is_named_in_one_line_and_nothing_is_recorded(self, tmp_path, at):
+    def test_one_that_returns_nan_is_named_in_one_line_and_only_what_it_showed_before_is_kept(self, tmp_path, at):
         with pytest.raises(TargetError, match=f"synthetic cart-pole: .* after step {at} is not finite") as caught:
             run(tmp_path, QUICK, Counted(breaks_at=at))
         assert "\n" not in str(caught.value)
-        assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+        assert not list(tmp_path.rglob("recording.h5"))
+        kept = Kept(tmp_path / "round-01" / "collected").load(torch.Generator())
+        assert [episode.samples for episode in kept] == ([] if at == 1 else [at - 1])
 
     def test_one_that_returns_nan_in_a_later_round_leaves_the_rounds_before(self, tmp_path):
         with pytest.raises(TargetError, match="not finite"):

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from visadapt.effects import Residual, SensingEffect
+from visadapt.learning.collection import Kept, collect
 from visadapt.learning.explanation import NOT_DIAGNOSED, Explain, Explanation
 from visadapt.learning.feedforward import initialise_feedforward
 from visadapt.learning.grounding import GroundLoss, fit_named, ground, rescale
@@ -34,16 +35,13 @@ from visadapt.progress import Progress, Report, staged
 from visadapt.recordings import Episode, read_recording, write_recording
 from visadapt.storage.checkpoints import CheckpointError, fitting, load_tree, load_weights, save_tree
 from visadapt.systems import System
-from visadapt.targets import Target, TargetError, TaskTarget
-from visadapt.targets.rollout import run
+from visadapt.targets import Target, TaskTarget
 from visadapt.tasks.base import Task
 from visadapt.world import World
 
 COLLECTING, GROUNDING, TUNING, ACCEPTING = range(4)  # Stages of a round, each with random numbers of its own
 
 LARGEST_SEED = 2**63 - 1  # Seeds are taken modulo this, so that a torch.Generator accepts them
-
-EXPLORATION = 0.05  # Standard deviation of white noise on the commands while data are collected
 
 Label = Callable[[list[Episode]], list[Episode]]  # Gives the episodes of a round the states that grounding learns from
 
@@ -180,14 +178,17 @@ class JointLearning:
     def _collect(self, folder: RoundFolder, samples: int) -> None:
         """Collect `samples` steps of the target, but no more than the ledger has left, and enter them in the ledger.
 
-        A round that was interrupted after its collection reads its recording instead.
+        A round that was interrupted goes on with the next episode or, after its collection, reads its recording.
         """
+        kept = Kept(folder.path / "collected")
         if not folder.recording.exists():
             collector, longest = self.explorer or self.policy, self.settings.longest_episode
             wanted = min(samples, self.ledger.left)
             added = self.found.experiment(collector, min(wanted, longest)) if self.found.experiment else None
-            episodes = collect(collector, self.target, wanted, longest, folder.generator(COLLECTING), added)
+            generator = folder.generator(COLLECTING)
+            episodes = collect(collector, self.target, wanted, longest, generator, added, kept)
             write_recording(folder.recording, episodes)
+        kept.remove()
         self.recordings.append(folder.recording)
         collected = read_recording(folder.recording)
         for episode in collected:
@@ -353,20 +354,6 @@ class JointLearning:
 
     def _progress(self, folder: RoundFolder, stage: str) -> Progress | None:
         return staged(self.report, f"{folder.name}: {stage}")
-
-
-def collect(
-    policy: Policy, target: Target, wanted: int, longest: int, generator: torch.Generator, added: Tensor | None = None
-) -> list[Episode]:
-    """Episodes of `wanted` samples under `policy`, one after the other as on a machine; `added` (steps, n_action) is
-    added to the commands of each."""
-    episodes: list[Episode] = []
-    while wanted > 0:
-        episodes.append(run(target, policy, 1, min(wanted, longest), generator, EXPLORATION, added)[0].episode)
-        if episodes[-1].samples == 0:
-            raise TargetError(f"{target.name}: the episode is over before its first step")
-        wanted -= episodes[-1].samples
-    return episodes
 
 
 def out_of_range(states: Sequence[NDArray[np.floating]], system: System) -> str:

@@ -72,6 +72,7 @@ def run(
     strict: bool = True,
     see: See | None = None,
     keep_frames: bool = True,
+    failed: Callable[[list[Run]], object] | None = None,
 ) -> list[Run]:
     """Run `batch` episodes of at most `steps` steps each; one that ends earlier is cut there, and not `survived`.
 
@@ -82,6 +83,7 @@ def run(
         strict: whether a state that is not finite is an error; if not, its episode ends before it.
         see: what the policy is shown, where that is not what `policy.shown` names.
         keep_frames: whether the runs hold the target's frames, which take 3 MB for an episode of 250 of 120 x 100 px.
+        failed: called with the runs up to the last observation where a step of the target raises an error.
 
     Raises:
         TargetError: the target shows a state that is not finite while its episode goes on, or no frame.
@@ -111,10 +113,15 @@ def run(
         if added is not None:
             action = (action + added[len(rows)].to(action)).clamp(low, high)
         rows.append((observation if keep_frames else replace(observation, frame=None), action))
-        observation = _seen_by(policy, checked_copy(target, target.step(action), batch), observation)
-        finite = observation.state.isfinite().all(1)
-        if strict:
-            _check_finite(target, observation, running, f"the state after step {len(rows)}")
+        try:
+            after = _seen_by(policy, checked_copy(target, target.step(action), batch), observation)
+            if strict:
+                _check_finite(target, after, running, f"the state after step {len(rows)}")
+        except Exception:
+            if failed is not None and len(rows) > 1:
+                failed([_cut(rows, b, int(length[b]), bool(running[b]), target.period) for b in range(batch)])
+            raise
+        observation, finite = after, after.state.isfinite().all(1)
         length += running & finite
         running &= observation.alive & finite
         history = history.acting(action.to(like)).observing(see(observation).to(like))
