@@ -36,6 +36,12 @@ def slow():
     return va.SyntheticTarget(period=0.1)
 
 
+def timeless():
+    target = Bare()
+    target.period = "50 ms"
+    return target
+
+
 def flying():
     return va.FlightTarget(va.setup_for(va.World(va.FixedWing())).settings.source.task, va.FixedWing())
 

@@ -85,6 +85,7 @@ def test_frames(here, trained, capsys):
         (("rig:needy",), "rig:needy: takes arguments (speed); a function without arguments is right"),
         (("rig:broken",), "RuntimeError: the motor is off"),
         (("rig:nonsense",), "rig:nonsense: returned a str; a visadapt.Target or a gymnasium environment is needed"),
+        (("rig:timeless",), "rig:timeless: its target's period is '50 ms'; the time between actions in s, above 0"),
         (("rig:slow",), "synthetic cart-pole has 0.1 s between actions"),
         (("rig:flying",), "a policy of a cartpole, with 1 commands; synthetic vehicle takes 4: it is another system"),
     ],
@@ -103,12 +104,12 @@ def test_targets_that_it_refuses(here, trained, capsys, arguments, says):
 def test_code_of_one_s_own_in_another_file_than_the_factory_s_is_named_where_it_raises(here, capsys):
     (here / "motor_driver.py").write_text(
         "import rig\n\n\nclass Driven(rig.Bare):\n    def step(self, action):\n"
-        "        raise RuntimeError('the driver reports over-current')\n"
+        "        raise OSError('the driver reports over-current')\n"
     )
     (here / "workshop").mkdir()
     (here / "workshop" / "parts.py").write_text("import motor_driver\n\nmake = motor_driver.Driven\n")
     line = refused(capsys, *score("--policy", va.shipped("cartpole_states"), "--target", "workshop.parts:make"))
-    assert line.endswith("motor_driver.py: line 6: RuntimeError: the driver reports over-current")
+    assert line.endswith("motor_driver.py: line 6: OSError: the driver reports over-current")
 
 
 def test_a_quadrotor_of_one_s_own_without_a_task_has_no_score(here, capsys):

@@ -59,8 +59,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (Exception, SystemExit) as error:
         # The messages of our own exceptions, of the system's and of the user's code are for whoever runs the command.
         message: object = error
-        if not isinstance(error, OSError) and type(error).__module__.partition(".")[0] not in ("visadapt", "renderers"):
-            message = own_line(error)
+        if type(error).__module__.partition(".")[0] not in ("visadapt", "renderers"):
+            message = own_line(error) or (error if isinstance(error, OSError) else None)
             if message is None:
                 raise
         print(f"visadapt: {in_one_line(message)}", file=sys.stderr)

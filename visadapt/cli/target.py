@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 import warnings
 from collections.abc import Callable
 from inspect import Parameter, signature
+from numbers import Real
 from typing import Any
 
 import torch
@@ -94,6 +96,7 @@ def _from_factory(name: str, mapping: EnvMap | None) -> Target | Callable[[], An
     if isinstance(made, Target):
         if mapping is not None:
             raise InputError(f"{name}: returns a visadapt.Target, for which --map has no use: leave it out")
+        _check_attributes(name, made)
         return made
     if not hasattr(made, "action_space") or not hasattr(made, "reset"):
         kind = type(made).__name__
@@ -102,6 +105,16 @@ def _from_factory(name: str, mapping: EnvMap | None) -> Target | Callable[[], An
         raise InputError(f"{name}: returned a gymnasium environment, which needs --map MAP.toml")
     ready = [made]
     return lambda: ready.pop() if ready else factory()
+
+
+def _check_attributes(name: str, target: Target) -> None:
+    """Raises InputError where a target of the user's lacks what a target has."""
+    if not isinstance(said := getattr(target, "name", None), str):
+        raise InputError(f"{name}: its target's name is {said!r}; a text, by which its runs are known, is right")
+    for attribute, right in (("period", "the time between actions in s"), ("n_action", "the number of its commands")):
+        value = getattr(target, attribute, None)
+        if not isinstance(value, Real) or isinstance(value, bool) or not 0 < float(value) < math.inf:
+            raise InputError(f"{name}: its target's {attribute} is {value!r}; {right}, above 0, is right")
 
 
 def _arguments(factory: Callable[..., Any]) -> list[str]:
