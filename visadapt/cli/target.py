@@ -18,6 +18,8 @@ from visadapt.cli.user_code import as_input_error, describe, find_factory, own_c
 from visadapt.policies import Policy
 from visadapt.policies.flight import FollowPolicy
 from visadapt.setups.policy_file import load_policy, load_source
+from visadapt.systems import System
+from visadapt.systems.base import parameters
 from visadapt.targets import FollowingTarget, Target, TaskTarget
 from visadapt.targets.base import periods_differ
 from visadapt.targets.env_map import EnvMap
@@ -61,7 +63,23 @@ def load_policy_and_source(options: argparse.Namespace) -> tuple[Policy, World]:
     policy, source = load_policy(options.policy), load_source(options.policy)
     if options.system and options.system.name != source.system.name:
         raise InputError(f"{options.policy}: a policy of a {source.system.name}; --system is a {options.system.name}")
+    if options.system and (changed := _changed(source.system)):
+        print(
+            f"visadapt: {options.policy}: was made with {changed}; the policy's are used, a policy trained again has "
+            "the new ones",
+            file=sys.stderr,
+        )
     return policy, source
+
+
+def _changed(system: System) -> str:
+    """The parameters of a system that differ from the defaults of its class, in words."""
+    now = dict(parameters(type(system)()))
+    return ", ".join(
+        f"{name} {value:.6g} where {type(system).__name__} has {now[name]:.6g}"
+        for name, value in parameters(system)
+        if isinstance(value, Real) and isinstance(now[name], Real) and not math.isclose(value, now[name], rel_tol=1e-6)
+    )
 
 
 def load_target(options: argparse.Namespace, source: World, frames: bool) -> Target:
@@ -113,7 +131,7 @@ def _check_attributes(name: str, target: Target) -> None:
         raise InputError(f"{name}: its target's name is {said!r}; a text, by which its runs are known, is right")
     for attribute, right in (("period", "the time between actions in s"), ("n_action", "the number of its commands")):
         value = getattr(target, attribute, None)
-        if not isinstance(value, Real) or isinstance(value, bool) or not 0 < float(value) < math.inf:
+        if not isinstance(value, Real) or not 0 < float(value) < math.inf:
             raise InputError(f"{name}: its target's {attribute} is {value!r}; {right}, above 0, is right")
 
 

@@ -177,7 +177,8 @@ class EnvMap:
             if least < low[entry.index] - rounding or most > high[entry.index] + rounding:
                 raise TargetError(
                     f"{name}: the map sets action entry {entry.index} from {least:g} to {most:g}, the environment "
-                    f"takes {low[entry.index]:g} to {high[entry.index]:g}: change scale or offset"
+                    f"takes {low[entry.index]:g} to {high[entry.index]:g}: change scale or offset if its unit is "
+                    f"another one; if the machine takes less, give {ours.name} of the {system.name} that range"
                 )
 
     def state(self, observation: NDArray[np.floating], system: type[System]) -> NDArray[np.floating]:
