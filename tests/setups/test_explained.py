@@ -83,6 +83,31 @@ def test_a_command_of_the_opposite_sign_is_refused_where_no_episode_is_long_enou
         explain([tmp_path / "turned.h5"], tmp_path / "turned.json")
 
 
+@pytest.mark.parametrize(("of_the_sensor", "taken"), [(0.6, "constant_force"), (0.8, "angle_offset")])
+def test_of_explanations_that_fit_alike_one_with_right_sensors_is_taken_unless_a_wrong_one_is_clearly_likelier(
+    tmp_path, of_the_sensor, taken
+):
+    policy, generator = va.load_policy(va.shipped("cartpole_states")), torch.Generator().manual_seed(0)
+    va.write_recording(tmp_path / "a.h5", [va.run(va.SyntheticTarget(), policy, 1, 60, generator)[0].episode])
+    values = {"angle_offset": {"offset": 0.02}, "constant_force": {"force": 1.0}}
+    odds = {"angle_offset": of_the_sensor, "constant_force": 1 - of_the_sensor}
+    causes = [
+        {
+            "effect": name,
+            "parameters": {p: {"value": v, "unit": "", "ci90": [v, v]} for p, v in values[name].items()},
+            "slight": False,
+            "indistinguishable_from": [other for other in values if other != name],
+        }
+        for name in values
+    ]
+    ranking = [{"effects": [name], "probability": p, "gap_closed": 1.0} for name, p in odds.items()]
+    found = {"verdict": "ambiguous", "causes": causes, "ranking": ranking, "warnings": []}
+    write_json(tmp_path / "found.json", {"schema": SCHEMA_VERSION, "system": "cartpole", **found})
+    explanation = explained(va.World(va.CartPole()))([tmp_path / "a.h5"], tmp_path / "found.json")
+    assert [effect.name for effect in explanation.effects] == [taken]
+    assert [[effect.name for effect in each] for each in explanation.others] == [[n] for n in values if n != taken]
+
+
 def test_what_two_causes_explain_is_settled_by_an_experiment_in_the_next_round(tmp_path, monkeypatch, only_effects):
     only_effects("viscous_friction", "coulomb_friction", "actuator_gain")
     # Three excitations of one size, and coarser steps of the target, for the time they take.

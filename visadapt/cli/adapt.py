@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import copy
+from collections.abc import Collection, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -81,15 +82,27 @@ def run(options: argparse.Namespace) -> None:
 
 def _in_words(explanation: Explanation) -> str:
     """The last diagnosis, and what followed from it."""
-    causes = ", ".join(
-        f"{effect.name} ({', '.join(f'{p.name} {_value(effect, p)}' for p in effect.table)})"
-        f"{', slight' if effect.name in explanation.slight else ''}"
-        for effect in sorted(explanation.effects, key=lambda effect: effect.name in explanation.slight)
-    )
+    slight = explanation.slight
+    causes = _named(sorted(explanation.effects, key=lambda effect: effect.name in slight), slight)
     if not explanation.complete:
         learnt = f"{causes}; a residual learnt what they leave" if causes else "a residual learnt the gap"
-        return f"{explanation.verdict}: {learnt}"
-    return f"{explanation.verdict}: {causes}" if causes else f"{explanation.verdict}: the policy is left as it was"
+        nearest = f"; {explanation.nearest}" if explanation.nearest else ""
+        return f"{explanation.verdict}: {learnt}{nearest}"
+    if not causes:
+        return f"{explanation.verdict}: the policy is left as it was"
+    if not explanation.others:
+        return f"{explanation.verdict}: {causes}"
+    others = " or ".join(_named(each, slight) for each in explanation.others)
+    return f"{explanation.verdict}: {causes}; as well explained by {others}, for which --effect tunes the policy"
+
+
+def _named(effects: Sequence[Effect], slight: Collection[str]) -> str:
+    """Effects with their values; those that are `slight`, by name, are said to be."""
+    return ", ".join(
+        f"{effect.name} ({', '.join(f'{p.name} {_value(effect, p)}' for p in effect.table)})"
+        f"{', slight' if effect.name in slight else ''}"
+        for effect in effects
+    )
 
 
 def _value(effect: Effect, parameter: Parameter) -> str:

@@ -26,6 +26,10 @@ class Explanation:
     """whether they leave nothing for a residual to learn"""
     slight: frozenset[str] = frozenset()
     """names of those effects whose removal would reopen less than 1 % of the gap"""
+    others: Sequence[Sequence[Effect]] = ()
+    """the causes of each other explanation that fits as well"""
+    nearest: str = ""
+    """where the gap is unexplained, which effects come nearest to it, in words"""
     warnings: tuple[str, ...] = ()
     """of the recordings, and of the diagnosis"""
     experiment: Experiment | None = field(default=None, compare=False)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,8 +16,9 @@ from torch import Tensor, nn
 from visadapt.diagnosis import diagnose
 from visadapt.diagnosis.planning import plan
 from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, UNEXPLAINED
-from visadapt.diagnosis.saved import load_effects
+from visadapt.diagnosis.saved import load_explanations
 from visadapt.diagnosis.words import DERIVED, OPPOSITE, listed
+from visadapt.effects import Effect, SensingEffect
 from visadapt.learning.explanation import Explain, Explanation
 from visadapt.policies import Policy
 from visadapt.progress import Report, staged
@@ -35,13 +37,20 @@ OPPOSITE_ERROR = 0.25
 is the opposite one."""
 
 
+CLEARLY_LESS = 0.5
+"""Ratio of the probability that all sensors are right to that of a wrong one, among explanations that fit alike, down
+to which the sensors are believed."""
+
+WORTH_NAMING = 0.5  # Share of an unexplained gap from which on the effects that close it are named
+
+
 def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, report: Report | None = None) -> Explain:
     """Diagnoses recordings from all their states or, given the renderer of their scene, from their frames alone.
 
-    They are read and checked, and each diagnosis is written, as by `visadapt diagnose --json`. Where most samples are
-    in episodes shorter than a prediction, there is no diagnosis. Where the recordings cannot tell causes apart, the
-    likeliest is taken and, unless they are frames, an experiment is designed for the next round. Where the gap stays
-    unexplained, all of it is left to a residual.
+    They are read and checked, and each diagnosis is written, as by `visadapt diagnose --json`. Where most samples
+    are in episodes shorter than a prediction, there is no diagnosis. Where the recordings cannot tell causes apart,
+    the likeliest is taken, by preference one in which no sensor is wrong, and, unless they are frames, an
+    experiment is designed for the next round. Where the gap stays unexplained, all of it is left to a residual.
 
     Raises:
         ValueError: the source has effects, which a diagnosis would have to know.
@@ -72,7 +81,9 @@ def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, r
         _refuse_opposite_signs(path, content["warnings"])
         verdict = content["verdict"]
         slight = frozenset(cause["effect"] for cause in content["causes"] if cause["slight"])
-        effects = load_effects(path, source.system) if verdict in (IDENTIFIED, AMBIGUOUS) else []
+        effects, *others = [[]]
+        if verdict in (IDENTIFIED, AMBIGUOUS):
+            effects, *others = _sensors_believed(load_explanations(path, source.system), content["ranking"])
 
         def experiment(policy: Policy, steps: int) -> Tensor | None:
             """Commands (steps, n_action) to add that tell the causes apart, also written to plan.csv; or None."""
@@ -88,9 +99,44 @@ def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, r
         # A policy that is shown derived velocities acts on what no effect in the world stands for.
         complete = verdict != UNEXPLAINED and not any(DERIVED in warning for warning in content["warnings"])
         designs = experiment if verdict == AMBIGUOUS and renderer is None else None
-        return Explanation(verdict, effects, complete, slight, tuple(content["warnings"]), designs)
+        return Explanation(
+            verdict,
+            effects,
+            complete,
+            slight,
+            others,
+            _nearest(content["ranking"]) if verdict == UNEXPLAINED else "",
+            tuple(content["warnings"]),
+            designs,
+        )
 
     return explain
+
+
+def _sensors_believed(sets: list[list[Effect]], ranking: Sequence[Mapping[str, Any]]) -> list[list[Effect]]:
+    """Explanations that fit alike, the one by which the policy is tuned first: the likeliest, or the likeliest in which
+    all sensors are right, unless those in which one is wrong are clearly likelier together.
+
+    By the readings a policy is judged: one that is tuned for a wrong sensor where the motor is weak does worse by them
+    than the source policy.
+    """
+    probability = {frozenset(one["effects"]): one["probability"] for one in ranking}
+    odds = [probability.get(frozenset(effect.name for effect in each), 0.0) for each in sets]
+    wrong = [any(isinstance(effect, SensingEffect) for effect in each) for each in sets]
+    believed = sum(p for p, is_wrong in zip(odds, wrong, strict=True) if not is_wrong)
+    if not all(wrong) and believed > CLEARLY_LESS * (sum(odds) - believed):
+        first = wrong.index(False)
+        return [sets[first], *sets[:first], *sets[first + 1 :]]
+    return sets
+
+
+def _nearest(ranking: Sequence[Mapping[str, Any]]) -> str:
+    """What the likeliest effects close of the gap, in words; nothing, where that is not known or little."""
+    best = ranking[0] if ranking else {"effects": [], "gap_closed": None}
+    closed = best["gap_closed"]
+    if not best["effects"] or closed is None or closed < WORTH_NAMING:
+        return ""
+    return f"{listed(best['effects'])} alone would close {closed:.1%} of it".replace("%", " %")
 
 
 def steps_to_diagnose(source: World) -> int:
