@@ -146,7 +146,7 @@ class GymnasiumTarget(Target):
             if truncated and not terminated:
                 raise TargetError(
                     f"{self.name}: cut the episode short after {self._steps} steps; make it without a time limit "
-                    "(gymnasium.make(..., max_episode_steps=-1))"
+                    "(gymnasium.make(..., max_episode_steps=-1), or let its step return truncated False)"
                 )
             self._shown[b] = self._see(seen, b, terminated)
         return self._observe()
