@@ -143,7 +143,10 @@ def test_an_episode_ends_beyond_a_limit_and_starts_within_its_spread():
         ({"effort": 0.0}, "effort must be a positive number, got 0.0"),
         ({"start": {"angle": 1.0}}, "limits: angle starts up to 1 from the goal, and fails at 1"),
         ({"tolerance": {}}, "tolerance: name the states that are to be at the goal, of angle, rate"),
-        ({"goal": {"rate": 1.0}}, "there angle changes by 1 rad/s; angle taken to be 0 there, as the goal does not say"),
+        (
+            {"goal": {"rate": 1.0}},
+            "goal: no command within its range holds it: there angle changes by 1 rad/s; angle taken to be 0 there",
+        ),
     ],
 )
 def test_what_is_no_task_is_refused(change, line):
