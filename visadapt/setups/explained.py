@@ -83,7 +83,8 @@ def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, r
         slight = frozenset(cause["effect"] for cause in content["causes"] if cause["slight"])
         effects, *others = [[]]
         if verdict in (IDENTIFIED, AMBIGUOUS):
-            effects, *others = _sensors_believed(load_explanations(path, source.system), content["ranking"])
+            sets = _sensors_believed(load_explanations(path, source.system), content["ranking"])
+            effects, *others = _without_repeats(sets, slight)
 
         def experiment(policy: Policy, steps: int) -> Tensor | None:
             """Commands (steps, n_action) to add that tell the causes apart, also written to plan.csv; or None."""
@@ -128,6 +129,14 @@ def _sensors_believed(sets: list[list[Effect]], ranking: Sequence[Mapping[str, A
         first = wrong.index(False)
         return [sets[first], *sets[:first], *sets[first + 1 :]]
     return sets
+
+
+def _without_repeats(sets: Sequence[list[Effect]], slight: frozenset[str]) -> list[list[Effect]]:
+    """The explanations without those that differ from an earlier one in effects alone that are slight."""
+    kept: dict[frozenset[str], list[Effect]] = {}
+    for each in sets:
+        kept.setdefault(frozenset(effect.name for effect in each) - slight, each)
+    return list(kept.values())
 
 
 def _nearest(ranking: Sequence[Mapping[str, Any]]) -> str:
