@@ -24,6 +24,7 @@ from visadapt.policies import Policy
 from visadapt.progress import Report, staged
 from visadapt.recordings import Episode, load_recording
 from visadapt.recordings.hdf5 import read_stretches
+from visadapt.setups.nearest import keep_nearest, kept_nearest
 from visadapt.storage.run_folder import read_json, write_json
 from visadapt.targets.base import TargetError
 from visadapt.world import World
@@ -50,7 +51,8 @@ def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, r
     They are read and checked, and each diagnosis is written, as by `visadapt diagnose --json`. Where most samples
     are in episodes shorter than a prediction, there is no diagnosis. Where the recordings cannot tell causes apart,
     the likeliest is taken, by preference one in which no sensor is wrong, and, unless they are frames, an
-    experiment is designed for the next round. Where the gap stays unexplained, all of it is left to a residual.
+    experiment is designed for the next round. Where the gap stays unexplained, a residual is to learn it, beside
+    the nearest effects where these close nearly all of it.
 
     Raises:
         ValueError: the source has effects, which a diagnosis would have to know.
@@ -76,6 +78,7 @@ def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, r
         found = None
         if not path.exists():
             found = diagnosed()
+            keep_nearest(found, path)
             write_json(path, found.to_json())
         content = read_json(path)
         _refuse_opposite_signs(path, content["warnings"])
@@ -85,6 +88,9 @@ def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, r
         if verdict in (IDENTIFIED, AMBIGUOUS):
             sets = _sensors_believed(load_explanations(path, source.system), content["ranking"])
             effects, *others = _without_repeats(sets, slight)
+
+        elif verdict == UNEXPLAINED:
+            effects = kept_nearest(path)
 
         def experiment(policy: Policy, steps: int) -> Tensor | None:
             """Commands (steps, n_action) to add that tell the causes apart, also written to plan.csv; or None."""
@@ -106,7 +112,7 @@ def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, r
             complete,
             slight,
             others,
-            _nearest(content["ranking"]) if verdict == UNEXPLAINED else "",
+            _nearest(content["ranking"]) if verdict == UNEXPLAINED and not effects else "",
             tuple(content["warnings"]),
             designs,
         )
