@@ -83,6 +83,32 @@ def test_a_command_of_the_opposite_sign_is_refused_where_no_episode_is_long_enou
         explain([tmp_path / "turned.h5"], tmp_path / "turned.json")
 
 
+class Creep(va.DynamicsEffect):
+    """Dry friction of 3 N that lets the cart creep, as none of the library's does."""
+
+    name = "creep"
+    table = ()
+
+    def load(self, time, state, system):
+        force = -3.0 * (state[:, 1] / 0.1).tanh()
+        return torch.stack((force, torch.zeros_like(force)), -1)
+
+
+EFFECTS.pop("creep")  # no cause that a diagnosis may name
+
+
+def test_where_an_unexplained_gap_is_nearly_closed_a_residual_is_to_learn_the_rest_alone(tmp_path, only_effects):
+    only_effects("coulomb_friction", "actuator_gain")
+    policy, generator = va.load_policy(va.shipped("cartpole_states")), torch.Generator().manual_seed(0)
+    target = va.SyntheticTarget(lambda batch, generator: [Creep()])
+    va.write_recording(tmp_path / "a.h5", [va.run(target, policy, 1, 200, generator, exploration=0.3)[0].episode])
+    explain, path = explained(va.World(va.CartPole())), tmp_path / "found.json"
+    for explanation in (explain([tmp_path / "a.h5"], path), explain([tmp_path / "a.h5"], path)):
+        (friction,) = explanation.effects
+        assert (explanation.verdict, explanation.complete, friction.name) == ("unexplained", False, "coulomb_friction")
+        assert friction.get_parameter("force").item() == pytest.approx(3.0, rel=0.2)
+
+
 @pytest.mark.parametrize(("of_the_sensor", "taken"), [(0.6, "constant_force"), (0.8, "angle_offset")])
 def test_of_explanations_that_fit_alike_one_with_right_sensors_is_taken_unless_a_wrong_one_is_clearly_likelier(
     tmp_path, of_the_sensor, taken

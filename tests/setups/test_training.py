@@ -134,6 +134,13 @@ def test_a_policy_that_aims_at_goals_of_another_clock_is_refused():
         )
 
 
+def test_a_policy_is_not_tuned_in_a_world_of_another_period(policy):
+    with pytest.raises(
+        ValueError, match=r"trained for 0\.05 s .* every 0\.02 s: World\(\.\.\., period=0\.05\) is right"
+    ):
+        va.adapt(policy, va.World(va.CartPole(), period=0.02))
+
+
 def test_what_is_no_policy_or_no_world_is_told_what_would_be(policy):
     file: Any = "policy.safetensors"
     network: Any = torch.nn.Linear(4, 1)

@@ -24,6 +24,7 @@ from visadapt.setups.policy_file import save_policy
 from visadapt.setups.regulator import regulator
 from visadapt.systems import CartPole, FixedWing, Quadrotor
 from visadapt.targets import Target, TaskTarget
+from visadapt.targets.base import periods_differ
 from visadapt.tasks.follow import Follow
 from visadapt.tasks.reach import Reach
 from visadapt.tasks.references import Reference
@@ -274,7 +275,8 @@ def setup_to_adapt(
     """As `setup_for`, with the references, or the points, that a `TaskTarget` has.
 
     Raises:
-        ValueError: as `setup_for`, or other references than the target's own, with a history.
+        ValueError: as `setup_for`, other references than the target's own, with a history, or a world of another period
+            than that which the policy was trained for.
     """
     task = target.task if isinstance(target, TaskTarget) else None
     if isinstance(task, Follow):
@@ -284,6 +286,12 @@ def setup_to_adapt(
         elif with_history and not torch.equal(references.as_many().positions, own.positions):
             raise ValueError("the target has references of its own, from which histories start: give no others")
     setup = setup_for(source, policy, renderer, references, with_history)
+    trained = policy.trained_in["period"] if policy.trained_in else source.period
+    if periods_differ(trained, source.period):
+        raise ValueError(
+            f"the policy was trained for {trained:g} s between commands, the world is stepped every "
+            f"{source.period:g} s: World(..., period={trained:g}) is right"
+        )
     if isinstance(task, Reach) and isinstance(source.system, FixedWing):
         return fixed_wing(source, with_history, replace(task, system=source.system))
     return setup
