@@ -43,6 +43,7 @@ CLEARLY_LESS = 0.5
 to which the sensors are believed."""
 
 WORTH_NAMING = 0.5  # Share of an unexplained gap from which on the effects that close it are named
+MOST_NAMED = 3  # Effects; a longer list that leaves the gap unexplained says nothing of the machine
 
 
 def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, report: Report | None = None) -> Explain:
@@ -149,7 +150,7 @@ def _nearest(ranking: Sequence[Mapping[str, Any]]) -> str:
     """What the likeliest effects close of the gap, in words; nothing, where that is not known or little."""
     best = ranking[0] if ranking else {"effects": [], "gap_closed": None}
     closed = best["gap_closed"]
-    if not best["effects"] or closed is None or closed < WORTH_NAMING:
+    if not 0 < len(best["effects"]) <= MOST_NAMED or closed is None or closed < WORTH_NAMING:
         return ""
     return f"{listed(best['effects'])} alone would close {closed:.1%} of it".replace("%", " %")
 

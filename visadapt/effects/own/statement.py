@@ -25,7 +25,7 @@ def turns(angle: Variable) -> bool:
     return angle.unit == "rad" and angle.high - angle.low > MIN_RANGE
 
 
-SPEED = re.compile(r"([kcmu]?m|m?rad|deg|°|rev)/(s|min|h)|rpm|1/(s|min)")
+SPEED = re.compile(r"([kcmu]?m|ft|in|mi|m?rad|deg|°|rev)/(s|min|h)|rpm|kn|1/(s|min)")
 """Units of velocities"""
 
 
