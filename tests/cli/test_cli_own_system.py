@@ -183,7 +183,7 @@ def test_a_policy_for_it_is_read_where_system_names_its_class(rig):
         assert done.returncode == 0, done.stderr
     (rig / "belt.py").write_text(BELT.replace("slip: float = 0.1", "slip: float = 0.2"))
     done = command(*score, *own)
-    assert "p.safetensors: was made with slip 0.1 where BeltCart has 0.2; the policy's are used" in done.stderr
+    assert "p.safetensors: was made with slip 0.1 where BeltCart has 0.2; the policy's own are used" in done.stderr
     done = command(*score, "--system", "furuta.py:Furuta")
     assert "needs 'belt_cart'" in done.stderr
     shipped = ("score", "--policy", str(va.shipped("cartpole_states")), *target)

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import visadapt as va
-from visadapt.diagnosis import excitations
+from visadapt.diagnosis import excitations, planning
 from visadapt.diagnosis.result import Cause, Estimate, Gap, RecordingSummary, Where
 from visadapt.effects import catalogue as effects
 
@@ -78,6 +78,19 @@ def test_no_motion_tells_a_bias_of_the_motor_from_a_force(policy, pushed):
     assert str(planned).startswith("no excitation was found that tells constant_force from actuator")
 
 
+@pytest.mark.parametrize(
+    ("log_odds", "best"),
+    [
+        ([[9.0, 0.0], [8.0, 7.0]], (1, [0, 1])),  # tells both
+        ([[30.0, 0.0], [0.0, 40.0]], (1, [1])),  # none tells both
+        ([[1.0, 0.0], [2.0, 1.0]], (1, [0, 1])),  # none tells any
+        ([[9.0, -0.1], [-math.inf, -math.inf]], (0, [0])),  # one that is not admitted
+    ],
+)
+def test_the_excitation_that_tells_most_is_the_best(log_odds, best):
+    assert planning._best(torch.tensor(log_odds)) == best
+
+
 def test_the_file_is_what_is_added_over_time(tmp_path):
     time, added = 0.05 * np.arange(3), np.array([[0.1], [-0.2], [0.3]])
     path = tmp_path / "plan.csv"
@@ -126,7 +139,7 @@ def test_a_machine_without_a_policy_is_excited_about_the_commands_recorded():
     with_leak = va.plan(ambiguous(bias, leak, gain), recording, va.World(tank, (), 4.0), samples=40)
     assert (with_leak.explanations, with_leak.alike) == (planned.explanations, ((leak[0],),))
     assert with_leak.log_odds == pytest.approx(planned.log_odds, rel=0.1)
-    assert str(with_leak).endswith(f"; no excitation was found that tells it from {leak[0]}")
+    assert str(with_leak).endswith(f"; it does not tell it from {leak[0]}")
 
 
 def test_a_pole_that_falls_needs_the_policy(pushed):

@@ -6,6 +6,7 @@ import torch
 
 import visadapt as va
 from visadapt.learning.collection import Kept, collect
+from visadapt.learning.setback import Performance
 
 POLICY = va.load_policy(va.shipped("cartpole_states"))
 WANTED, LONGEST = 50, 20
@@ -35,7 +36,9 @@ def test_what_a_target_showed_before_it_failed_is_data_too(tmp_path):
     target.failing = 27
     with pytest.raises(OSError, match="no answer"):
         of(target, tmp_path / "kept")
+    assert Kept(tmp_path / "kept").cut() == [1]
     episodes = of(target, tmp_path / "kept")
+    assert Performance.of(episodes, LONGEST, None, cut=[1]).failures == 0
     assert [episode.samples for episode in episodes] == [20, 7, 20, 3]
     assert target.taken == WANTED
     assert all((episode.action[-1] == 0).all() for episode in episodes)

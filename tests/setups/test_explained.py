@@ -11,6 +11,7 @@ from visadapt.diagnosis.result import SCHEMA_VERSION
 from visadapt.effects import EFFECTS
 from visadapt.recordings import read_recording
 from visadapt.setups.explained import explained
+from visadapt.setups.nearest import kept_nearest
 from visadapt.storage.run_folder import read_json, write_json
 from visadapt.targets import TargetError, synthetic
 
@@ -50,6 +51,19 @@ def test_what_a_file_names_on_a_system_of_ones_own_is_known_before_it_is_read(tm
     assert effect.get_parameter("coefficient").item() == pytest.approx(0.1)
     with pytest.raises(ValueError, match=r"found.json: a diagnosis of a knee_of_a_test, where a cartpole is given"):
         va.load_effects(tmp_path / "found.json", va.CartPole())
+
+
+class Ankle(Pendulum):
+    name, loads = "ankle_of_a_test", (va.Variable("ankle", "N m", -1.0, 1.0),)
+
+
+def test_the_nearest_effects_on_a_system_of_ones_own_are_known_before_they_are_read(tmp_path):
+    assert "ankle.coulomb_friction" not in EFFECTS
+    write_json(tmp_path / "nearest.json", {"ankle.coulomb_friction": {"torque": 0.1}})
+    (effect,) = kept_nearest(tmp_path / "diagnosis.json", Ankle())
+    assert effect.get_parameter("torque").item() == pytest.approx(0.1)
+    with pytest.raises(ValueError, match=r"nearest\.json: names ankle\.coulomb_friction, which is not known here"):
+        kept_nearest(tmp_path / "diagnosis.json", va.CartPole())
 
 
 def test_an_angle_of_the_opposite_sign_is_refused_since_the_policy_would_drive_the_wrong_way(tmp_path, only_effects):

@@ -84,16 +84,13 @@ def _in_words(explanation: Explanation) -> str:
     """The last diagnosis, and what followed from it."""
     slight = explanation.slight
     causes = _named(sorted(explanation.effects, key=lambda effect: effect.name in slight), slight)
-    if not explanation.complete:
-        learnt = f"{causes}; a residual learnt what they leave" if causes else "a residual learnt the gap"
-        nearest = f"; {explanation.nearest}" if explanation.nearest else ""
-        return f"{explanation.verdict}: {learnt}{nearest}"
-    if not causes:
-        return f"{explanation.verdict}: the policy is left as it was"
-    if not explanation.others:
-        return f"{explanation.verdict}: {causes}"
     others = " or ".join(_named(each, slight) for each in explanation.others)
-    return f"{explanation.verdict}: {causes}; as well explained by {others}, for which --effect tunes the policy"
+    alike = f"; as well explained by {others}, for which --effect tunes the policy" if others else ""
+    if explanation.complete:
+        return f"{explanation.verdict}: {causes or 'the policy is left as it was'}{alike}"
+    learnt = f"{causes}; a residual learnt what they leave" if causes else "a residual learnt the gap"
+    nearest = f"; {explanation.nearest}" if explanation.nearest else ""
+    return f"{explanation.verdict}: {learnt}{alike}{nearest}"
 
 
 def _named(effects: Sequence[Effect], slight: Collection[str]) -> str:

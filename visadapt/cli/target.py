@@ -8,7 +8,7 @@ import sys
 import warnings
 from collections.abc import Callable
 from inspect import Parameter, signature
-from numbers import Real
+from numbers import Integral, Real
 from typing import Any
 
 import torch
@@ -65,8 +65,7 @@ def load_policy_and_source(options: argparse.Namespace) -> tuple[Policy, World]:
         raise InputError(f"{options.policy}: a policy of a {source.system.name}; --system is a {options.system.name}")
     if options.system and (changed := _changed(source.system)):
         print(
-            f"visadapt: {options.policy}: was made with {changed}; the policy's are used, a policy trained again has "
-            "the new ones",
+            f"visadapt: {options.policy}: was made with {changed}; the policy's own are used",
             file=sys.stderr,
         )
     return policy, source
@@ -131,7 +130,7 @@ def _check_attributes(name: str, target: Target) -> None:
         raise InputError(f"{name}: its target's name is {said!r}; a text, by which its runs are known, is right")
     for attribute, right in (("period", "the time between actions in s"), ("n_action", "the number of its commands")):
         value = getattr(target, attribute, None)
-        if not isinstance(value, Real) or not 0 < float(value) < math.inf:
+        if not isinstance(value, Real if attribute == "period" else Integral) or not 0 < float(value) < math.inf:
             raise InputError(f"{name}: its target's {attribute} is {value!r}; {right}, above 0, is right")
 
 

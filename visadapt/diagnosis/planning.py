@@ -4,9 +4,8 @@ An ambiguous diagnosis names effects that fit a recording equally well. Each exp
 excitation of a family (square waves, sines, pseudo-random binary sequences, white noise; the largest that keeps all
 states within 0.9 of the system's ranges, about their middles), and every explanation is fitted to what each shows. The
 worth of an excitation is the log posterior odds of the true against the other explanation: the least over all pairs of
-the first explanation and another that some excitation tells from it, with either of them true. This is the expected
-information of Box and Hill (1967), Technometrics 9(1), with fits in place of a linear model and the worst case in place
-of the mean.
+the first explanation and another that it tells from it, with either of them true. This is the expected information of
+Box and Hill (1967), Technometrics 9(1), with fits in place of a linear model and the worst case in place of the mean.
 
 The odds are those of readings without noise under the recording's noise, which is what they are on average: drawn noise
 would add a few units at random, and the best of many excitations would be the luckiest.
@@ -32,7 +31,6 @@ from visadapt.diagnosis.search.fitted_models import FittedModels
 from visadapt.diagnosis.search.preparation import limited, prepare
 from visadapt.diagnosis.words import number, with_unit
 from visadapt.effects import EFFECTS, Effect
-from visadapt.effects.catalogue import twins
 from visadapt.estimation.fit_states import CAREFUL, QUICK, with_effect
 from visadapt.estimation.likelihood import FitState
 from visadapt.history import History
@@ -63,7 +61,7 @@ class Plan:
     """
 
     explanations: tuple[tuple[str, ...], ...]
-    """names of the effects of each; the first is told apart from the others, where any excitation does that"""
+    """names of the effects of each; the first is told apart from the others, if the experiment `settles` anything"""
     excitation: str
     """in words"""
     time: NDArray[np.floating]
@@ -79,7 +77,7 @@ class Plan:
     is_all: bool = False
     """whether `added` is all of the commands: no policy was given"""
     alike: tuple[tuple[str, ...], ...] = ()
-    """names of the effects of each explanation that no excitation tells from the first, where some tell others"""
+    """names of the effects of each explanation that this excitation is not expected to tell from the first"""
 
     @property
     def settles(self) -> bool:
@@ -92,7 +90,7 @@ class Plan:
             return f"no excitation was found that tells {first} from {others}"
         white = "" if math.isnan(self.white) else f"; {self.white:.0f} for white noise"
         what = f"command {self.excitation}" if self.is_all else f"add {self.excitation} to the commands"
-        alike = f"; no excitation was found that tells it from {_either(self.alike)}" if self.alike else ""
+        alike = f"; it does not tell it from {_either(self.alike)}" if self.alike else ""
         return (
             f"to tell {first} from {others}: {what}, for {self.time[-1]:.3g} s (expected log odds "
             f"{self.log_odds:.0f}{white}){alike}"
@@ -150,24 +148,21 @@ def plan(
     sets = _explained(found)
     generator = torch.Generator().manual_seed(seed)
     trials = _Trials.of(sets, recording, found.where.pushes, source.system, policy, samples, generator)
-    by_rival = trials.worth(sets, progress)
-    # Of rivals that do exactly the same under every excitation, none would be worth anything against all.
-    told = by_rival.nan_to_num(-math.inf).amax(0) > WORTH
-    worth = by_rival[:, told if bool(told.any()) else slice(None)].amin(1)
-    best = int(worth.nan_to_num(-math.inf).argmax())
-    white = [k for k, name in enumerate(trials.names) if name.startswith("white")]
+    worth = trials.worth(sets, progress)
+    best, apart = _best(worth)
+    least = worth[:, apart].amin(1)
+    white = least[[name.startswith("white") for name in trials.names]]
     names = [tuple(effect.name for effect in each) for each in sets]
-    apart = [each for each, is_told in zip(names[1:], told.tolist(), strict=True) if is_told] or names[1:]
     return Plan(
-        explanations=(names[0], *apart),
+        explanations=(names[0], *(names[1:][k] for k in apart)),
         excitation=f"{trials.names[best]} ({SIZES[int(trials.largest[best])]:g} of half the range{trials.about})",
         time=recording.period * np.arange(samples),
         added=trials.added[trials.row(best)].numpy(),
         actions=tuple(action.name for action in source.system.actions),
-        log_odds=float(worth[best]),
-        white=_highest(worth[white]),
+        log_odds=float(least[best]),
+        white=float(white.max()) if bool(white.isfinite().any()) else math.nan,
         is_all=policy is None,
-        alike=tuple(each for each in names[1:] if each not in apart),
+        alike=tuple(each for k, each in enumerate(names[1:]) if k not in apart),
     )
 
 
@@ -226,49 +221,40 @@ class _Trials:
 
     def worth(self, sets: Sequence[Sequence[Effect]], progress: Progress | None) -> Tensor:
         """Log odds (E, sets - 1) of the true against the other of two explanations, the first and each of the others,
-        whichever is true; NaN where no size is admitted."""
-        worth = torch.full((len(self.names), len(sets)), math.nan)
-        # Explanations that do exactly the same as an earlier one need no fits.
-        like = [
-            next(k for k in range(len(sets)) if k == n or _same(sets[k], sets[n], self.system))
-            for n in range(len(sets))
-        ]
+        whichever is true; minus infinity where no size is admitted."""
+        worth = torch.full((len(self.names), len(sets) - 1), -math.inf)
         for done, k in enumerate(torch.nonzero(self.largest >= 0)[:, 0].tolist()):
             row = self.row(k)
             runs = [(states[row], commands[row]) for states, commands in self.shown]
             recordings = [_recording(self.recording, self.system, self.measured, *run, self.noise) for run in runs]
-            worth[k, 0] = 0.0
             for rival in range(1, len(sets)):
-                worth[k, rival] = (
-                    min(
-                        _lead(sets[truth], sets[other], recordings[truth], self.system)
-                        for truth, other in ((0, rival), (rival, 0))
-                    )
-                    if like[rival] == rival
-                    else worth[k, like[rival]]
+                worth[k, rival - 1] = min(
+                    _lead(sets[truth], sets[other], recordings[truth], self.system)
+                    for truth, other in ((0, rival), (rival, 0))
                 )
             if progress is not None:
-                progress(done + 1, len(self.names), float(worth[:, 1:].nan_to_num(-math.inf).max()))
-        return worth[:, 1:]
+                best, apart = _best(worth)
+                progress(done + 1, len(self.names), float(worth[best, apart].min()))
+        return worth
 
 
-def _same(one: Sequence[Effect], other: Sequence[Effect], system: System) -> bool:
-    """Whether two explanations differ in one effect each, and no motion tells these two apart."""
-    ours, theirs = ({type(effect) for effect in each} for each in (one, other))
-    if len(ours - theirs) != 1 or len(theirs - ours) != 1:
-        return False
-    [effect] = ours - theirs
-    return bool(twins(effect, theirs - ours, system))
+def _best(worth: Tensor) -> tuple[int, list[int]]:
+    """The best excitation, and the rivals that it tells from the first explanation, by the log odds (E, rivals).
+
+    It tells most rivals and, among those that tell as many, has the highest log odds of the one that it tells least.
+    Where no excitation tells any, the rivals are all.
+    """
+    told = worth > WORTH
+    if not bool(told.any()):
+        return int(worth.amin(1).argmax()), list(range(worth.shape[1]))
+    least = torch.where(told, worth, CERTAIN).amin(1)
+    most = told.sum(1) == told.sum(1).max()
+    best = int(torch.where(most, least, -math.inf).argmax())
+    return best, told[best].nonzero()[:, 0].tolist()
 
 
 def _either(sets: Sequence[Sequence[str]]) -> str:
     return " or ".join(" and ".join(names) for names in sets)
-
-
-def _highest(values: Tensor) -> float:
-    """The largest of values (N,) that are not NaN; NaN where none is."""
-    known = values[~values.isnan()]
-    return float(known.max()) if len(known) else math.nan
 
 
 def _explained(found: Diagnosis) -> list[list[Effect]]:

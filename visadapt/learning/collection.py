@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from visadapt.storage.checkpoints import fitting, load_tree, save_tree
 from visadapt.targets import Target, TargetError
 from visadapt.targets.rollout import Run, run
 
+CUT = "-cut"  # Ends the name of the file of an episode that ends where the target failed
 EXPLORATION = 0.05  # Standard deviation of white noise on the commands while data are collected
 
 
@@ -39,11 +41,16 @@ class Kept:
                 generator.set_state(tree["generator"])
         return episodes
 
-    def add(self, number: int, episode: Episode, generator: torch.Generator) -> None:
-        """Keep the episode of this number."""
+    def cut(self) -> list[int]:
+        """Which of them, from 0 on, end where the target failed."""
+        return [k for k, path in enumerate(sorted(self.folder.glob("*.safetensors"))) if path.stem.endswith(CUT)]
+
+    def add(self, number: int, episode: Episode, generator: torch.Generator, cut: bool) -> None:
+        """Keep the episode of this number; `cut`: it ends where the target failed."""
         self.folder.mkdir(parents=True, exist_ok=True)
         arrays = {name: None if one is None else torch.from_numpy(one) for name, one in asdict(episode).items()}
-        save_tree(self.folder / f"{number:06d}.safetensors", {"episode": arrays, "generator": generator.get_state()})
+        name = f"{number:06d}{CUT if cut else ''}.safetensors"
+        save_tree(self.folder / name, {"episode": arrays, "generator": generator.get_state()})
 
     def remove(self) -> None:
         """Once the episodes are written elsewhere."""
@@ -69,16 +76,17 @@ def collect(
     """
     episodes = kept.load(generator) if kept else []
 
-    def keep(runs: Sequence[Run]) -> None:
+    def keep(runs: Sequence[Run], cut: bool) -> None:
         episodes.append(runs[0].episode)
         if kept:
-            kept.add(len(episodes), episodes[-1], generator)
+            kept.add(len(episodes), episodes[-1], generator, cut)
 
-    failed: Callable[[Sequence[Run]], None] | None = keep if kept else None
+    failed = partial(keep, cut=True) if kept else None
     wanted -= sum(episode.samples for episode in episodes)
     while wanted > 0:
-        keep(run(target, policy, 1, min(wanted, longest), generator, EXPLORATION, added, failed=failed))
-        if episodes[-1].samples == 0:
+        runs = run(target, policy, 1, min(wanted, longest), generator, EXPLORATION, added, failed=failed)
+        if runs[0].episode.samples == 0:
             raise TargetError(f"{target.name}: the episode is over before its first step")
+        keep(runs, cut=False)
         wanted -= episodes[-1].samples
     return episodes

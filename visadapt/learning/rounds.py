@@ -34,6 +34,7 @@ from visadapt.policies.networks import FlightResidualNetwork
 from visadapt.progress import Progress, Report, staged
 from visadapt.recordings import Episode, read_recording, write_recording
 from visadapt.storage.checkpoints import CheckpointError, fitting, load_tree, load_weights, save_tree
+from visadapt.storage.run_folder import read_json, write_json
 from visadapt.systems import System
 from visadapt.targets import Target, TaskTarget
 from visadapt.tasks.base import Task
@@ -76,6 +77,11 @@ class RoundFolder:
     def recording(self) -> Path:
         """Episodes that were collected."""
         return self.path / "recording.h5"
+
+    @property
+    def cut(self) -> Path:
+        """Which episodes, from 0 on, end where the target failed; missing where none does."""
+        return self.path / "cut.json"
 
     @property
     def diagnosis(self) -> Path:
@@ -140,6 +146,7 @@ class JointLearning:
         self.policy.residual = self.residual
         self._began_with = copy.deepcopy(self.policy.state_dict())
         self._collected: list[list[Episode]] = []  # those of each round
+        self._cut: list[list[int]] = []  # of each round, which episodes end where the target failed
 
     @property
     def known(self) -> World:
@@ -187,6 +194,8 @@ class JointLearning:
             added = self.found.experiment(collector, min(wanted, longest)) if self.found.experiment else None
             generator = folder.generator(COLLECTING)
             episodes = collect(collector, self.target, wanted, longest, generator, added, kept)
+            if cut := kept.cut():
+                write_json(folder.cut, {"episodes": cut})
             write_recording(folder.recording, episodes)
         kept.remove()
         self.recordings.append(folder.recording)
@@ -195,6 +204,7 @@ class JointLearning:
             self.ledger.count(f"{folder.name}: data", episode.samples)
         self.waiting += collected
         self._collected.append(collected)
+        self._cut.append(read_json(folder.cut)["episodes"] if folder.cut.exists() else [])
 
     def take_back(self) -> str:
         """Give the policy what it began with, if it did much worse in later rounds' data than in the first's; why, or
@@ -210,7 +220,8 @@ class JointLearning:
         elif self.observe is not None or any(isinstance(effect, SensingEffect) for effect in self.found.effects):
             task = None
         longest = self.settings.longest_episode
-        why = setback([Performance.of(each, longest, task) for each in self._collected])
+        rounds = zip(self._collected, self._cut, strict=True)
+        why = setback([Performance.of(each, longest, task, cut) for each, cut in rounds])
         if why:
             self.policy.load_state_dict(self._began_with)
             self.found = NOT_DIAGNOSED

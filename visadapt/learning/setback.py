@@ -7,7 +7,7 @@ which the machine is not. Only the machine shows it, in the data that the next r
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,13 +34,13 @@ class Performance:
     cost: float  # mean cost of what was executed, by the task; NaN where that is not known
 
     @classmethod
-    def of(cls, episodes: Sequence[Episode], longest: int, task: Task | None) -> Performance:
+    def of(cls, episodes: Sequence[Episode], longest: int, task: Task | None, cut: Collection[int] = ()) -> Performance:
         """Of the episodes of a round, in which none was to last more than `longest` steps; without a task, at no cost
-        that is known."""
+        that is known. Those that were `cut`, by number, ended where the target failed, which is not the policy's."""
         left = steps = sum(episode.samples for episode in episodes)
         failures = 0
-        for episode in episodes:
-            failures += episode.samples < min(left, longest)
+        for number, episode in enumerate(episodes):
+            failures += episode.samples < min(left, longest) and number not in cut
             left -= episode.samples
         costs = np.concatenate([np.zeros(0), *(_costs(episode, task) for episode in episodes if task is not None)])
         return cls(steps, failures, float(costs.mean()) if len(costs) else math.nan)

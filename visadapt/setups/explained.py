@@ -85,13 +85,14 @@ def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, r
         _refuse_opposite_signs(path, content["warnings"])
         verdict = content["verdict"]
         slight = frozenset(cause["effect"] for cause in content["causes"] if cause["slight"])
-        effects, *others = [[]]
+        effects: list[Effect] = []
+        others: list[list[Effect]] = []
         if verdict in (IDENTIFIED, AMBIGUOUS):
             sets = _sensors_believed(load_explanations(path, source.system), content["ranking"])
             effects, *others = _without_repeats(sets, slight)
 
         elif verdict == UNEXPLAINED:
-            effects = kept_nearest(path)
+            effects = kept_nearest(path, source.system)
 
         def experiment(policy: Policy, steps: int) -> Tensor | None:
             """Commands (steps, n_action) to add that tell the causes apart, also written to plan.csv; or None."""
@@ -128,7 +129,7 @@ def _sensors_believed(sets: list[list[Effect]], ranking: Sequence[Mapping[str, A
     By the readings a policy is judged: one that is tuned for a wrong sensor where the motor is weak does worse by them
     than the source policy.
     """
-    probability = {frozenset(one["effects"]): one["probability"] for one in ranking}
+    probability = {frozenset(one["effects"]): one["probability"] for one in reversed(ranking)}
     odds = [probability.get(frozenset(effect.name for effect in each), 0.0) for each in sets]
     wrong = [any(isinstance(effect, SensingEffect) for effect in each) for each in sets]
     believed = sum(p for p, is_wrong in zip(odds, wrong, strict=True) if not is_wrong)

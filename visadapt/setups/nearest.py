@@ -7,9 +7,12 @@ from pathlib import Path
 
 from visadapt.diagnosis import Diagnosis
 from visadapt.diagnosis.result import UNEXPLAINED, first_explanation
+from visadapt.diagnosis.saved import DiagnosisFileError
 from visadapt.effects import EFFECTS, ActuationEffect, DynamicsEffect, Effect
 from visadapt.effects.base import Role
+from visadapt.effects.catalogue import catalogue
 from visadapt.storage.run_folder import read_json, write_json
+from visadapt.systems import System
 
 WORTH_USING = 0.9
 """Share of the gap, on held-out episodes, that the nearest effects must close for a residual to learn only the rest. Of
@@ -33,11 +36,20 @@ def keep_nearest(found: Diagnosis, path: Path) -> None:
         write_json(_beside(path), values)
 
 
-def kept_nearest(path: Path) -> list[Effect]:
-    """The effects that `keep_nearest` wrote beside the diagnosis at `path`; none, if it wrote none."""
+def kept_nearest(path: Path, system: System) -> list[Effect]:
+    """The effects on the system that `keep_nearest` wrote beside the diagnosis at `path`; none, if it wrote none.
+
+    Raises:
+        DiagnosisFileError: one of them is not known here.
+    """
     if not _beside(path).exists():
         return []
-    return [EFFECTS[name](**values) for name, values in read_json(_beside(path)).items()]
+    by_name = {effect.name: effect for effect in catalogue(system)}
+    content = read_json(_beside(path))
+    for name in content:
+        if name not in by_name:
+            raise DiagnosisFileError(f"{_beside(path)}: names {name}, which is not known here")
+    return [by_name[name](**values) for name, values in content.items()]
 
 
 def _beside(path: Path) -> Path:

@@ -97,7 +97,9 @@ def _stopped(
             moved[:, position] = moved[:, position] + 0.5 * left * h * gain[:, velocity] * impulse
         moved[:, own] = torch.where(reverses, kept, last)  # exactly at rest
         if outside:  # what flows or is induced with the motion, as a cylinder's pressure or a motor's current
-            slower = after.index_copy(1, torch.tensor([own], device=after.device), moved[:, own : own + 1])
+            velocities = [velocity for _, velocity in system.coordinates]
+            slower = after.clone()
+            slower[:, velocities] = moved[:, velocities]
             rates = _free(system, slower, command) - _free(system, after, command)
             moved[:, outside] = moved[:, outside] + (0.5 * left * h)[:, None] * rates[:, outside]
         after = moved

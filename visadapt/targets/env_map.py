@@ -178,7 +178,7 @@ class EnvMap:
                 raise TargetError(
                     f"{name}: the map sets action entry {entry.index} from {least:g} to {most:g}, the environment "
                     f"takes {low[entry.index]:g} to {high[entry.index]:g}: change scale or offset if its unit is "
-                    f"another one; if the machine takes less, give {ours.name} of the {system.name} that range"
+                    f"another one; if the machine takes less, a {system.name} whose {ours.name} has that range is right"
                 )
 
     def state(self, observation: NDArray[np.floating], system: type[System]) -> NDArray[np.floating]:

@@ -103,7 +103,7 @@ class Regulate(Task):
         for each, unit in ((rates, "s"), (changes, "s2")):
             for state, rate, weight in zip(self.system.states, each.tolist(), self.weights.tolist(), strict=True):
                 if weight and abs(rate) * math.sqrt(weight) > MAX_RATE_AT_GOAL:
-                    unnamed = [each.name for each in self.system.states if each.name not in self.goal]
+                    unnamed = [one.name for one in self.system.states if one.name not in self.goal]
                     taken = f"; {', '.join(unnamed)} taken to be 0 there, as the goal does not say" if unnamed else ""
                     raise ValueError(
                         f"goal: no command within its range holds it: there {state.name} changes by {rate:.3g} "

@@ -25,13 +25,16 @@ def turns(angle: Variable) -> bool:
     return angle.unit == "rad" and angle.high - angle.low > MIN_RANGE
 
 
-SPEED = re.compile(r"([kcmu]?m|ft|in|mi|m?rad|deg|°|rev)/(s|min|h)|rpm|kn|1/(s|min)")
-"""Units of velocities"""
+STILL = re.compile(
+    r"[kcm]?m|m3|[cdm]?[lL]|K|°C|degC|[mu]?A|[mk]?V|[hkM]?Pa|m?bar|[mk]?mol(/.*)?|k?g(/.*)?|(m3|[cdm]?[lL])/(s|min|h)|"
+    r"[kM]?[JW]|%"
+)
+"""Units of levels, temperatures, currents, pressures, amounts and flows: of what does not move"""
 
 
 def slides(position: Variable | None, velocity: Variable) -> bool:
     """Whether a coordinate moves, so that dry friction can hold it; a level, a temperature or a current does not."""
-    return position is not None or SPEED.fullmatch(velocity.unit) is not None
+    return position is not None or STILL.fullmatch(velocity.unit) is None
 
 
 def delay_of_all(system: type[System]) -> str:
