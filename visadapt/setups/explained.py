@@ -37,7 +37,6 @@ OPPOSITE_ERROR = 0.25
 """Mean square error of single steps with the opposite sign, over that with the source's, below which the target's sign
 is the opposite one."""
 
-
 CLEARLY_LESS = 0.5
 """Ratio of the probability that all sensors are right to that of a wrong one, among explanations that fit alike, down
 to which the sensors are believed."""
@@ -90,7 +89,6 @@ def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, r
         if verdict in (IDENTIFIED, AMBIGUOUS):
             sets = _sensors_believed(load_explanations(path, source.system), content["ranking"])
             effects, *others = _without_repeats(sets, slight)
-
         elif verdict == UNEXPLAINED:
             effects = kept_nearest(path, source.system)
 
@@ -108,15 +106,9 @@ def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, r
         # A policy that is shown derived velocities acts on what no effect in the world stands for.
         complete = verdict != UNEXPLAINED and not any(DERIVED in warning for warning in content["warnings"])
         designs = experiment if verdict == AMBIGUOUS and renderer is None else None
+        nearest = _nearest(content["ranking"]) if verdict == UNEXPLAINED and not effects else ""
         return Explanation(
-            verdict,
-            effects,
-            complete,
-            slight,
-            others,
-            _nearest(content["ranking"]) if verdict == UNEXPLAINED and not effects else "",
-            tuple(content["warnings"]),
-            designs,
+            verdict, effects, complete, slight, others, nearest, tuple(content["warnings"]), experiment=designs
         )
 
     return explain
