@@ -58,6 +58,15 @@ def nonsense():
     return "a robot"
 
 
+class Turned(va.SyntheticTarget):
+    def step(self, action):
+        return super().step(-action)
+
+
+def turned():
+    return Turned()
+
+
 class Bare(va.Target):
     \"\"\"A target that sets no more than a target must.\"\"\"
 

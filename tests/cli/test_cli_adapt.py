@@ -53,6 +53,13 @@ def test_on_a_gymnasium_environment(here, trained, capsys):
     assert json.loads((here / "run" / "ledger.json").read_text())["used"] == 40
 
 
+def test_a_command_of_the_opposite_sign_is_said_without_a_diagnosis_too(here, capsys):
+    for target in ("rig:turned", "rig:states"):
+        assert run("adapt", "--policy", SHIPPED, "--target", target, *SMALL[:-1], target[4:]) == 0
+        warned = "Warning    command of the target has the opposite sign" in capsys.readouterr().out
+        assert warned == (target == "rig:turned")
+
+
 def test_effects_of_a_diagnosis_are_fitted_to_the_target(here, trained, diagnosis):
     policy = ("--policy", trained / "states.safetensors", "--target", "rig:states")
     assert run("adapt", *policy, "--diagnosis", diagnosis([("constant_force", {"force": 0.0})]), *SMALL) == 0
