@@ -2,9 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING
 
-from visadapt.diagnosis.result import Cause, first_explanation
+from visadapt.effects import EFFECTS, SensingEffect
+
+if TYPE_CHECKING:
+    from visadapt.diagnosis.result import Cause
+
+CLEARLY_LESS = 0.5
+"""Ratio of the probability that all sensors are right to that of a wrong one, among explanations that fit alike, down
+to which the sensors are believed."""
+
+
+def first_explanation(causes: Iterable[Cause]) -> list[Cause]:
+    """The causes without those that an earlier one cannot be told from."""
+    taken: list[Cause] = []
+    for cause in causes:
+        if not any(cause.effect in (one.effect, *one.indistinguishable_from) for one in taken):
+            taken.append(cause)
+    return taken
 
 
 def explanations(causes: Sequence[Cause]) -> list[list[Cause]]:
@@ -32,3 +49,20 @@ def explanations(causes: Sequence[Cause]) -> list[list[Cause]]:
             kept = [each for each in first if rival not in each.indistinguishable_from]
             exchanged.setdefault(frozenset(together), [*kept, *(of_name[name] for name in together)])
     return [first, *exchanged.values()]
+
+
+def preferred(causes: Sequence[Cause], probability: Mapping[frozenset[str], float]) -> list[list[Cause]]:
+    """The explanations, the one to simulate and to tune a policy by first: the likeliest, or the likeliest in which all
+    sensors are right, unless those in which one is wrong are clearly likelier together.
+
+    By its readings a machine is judged: where the motor is weak, a policy that is tuned for a wrong sensor does worse
+    by them than the source policy. `probability` is that of sets of effects, by their names.
+    """
+    sets = explanations(causes)
+    odds = [probability.get(frozenset(cause.effect for cause in each), 0.0) for each in sets]
+    wrong = [any(issubclass(EFFECTS[cause.effect], SensingEffect) for cause in each) for each in sets]
+    believed = sum(p for p, is_wrong in zip(odds, wrong, strict=True) if not is_wrong)
+    if not all(wrong) and believed > CLEARLY_LESS * (sum(odds) - believed):
+        first = wrong.index(False)
+        return [sets[first], *sets[:first], *sets[first + 1 :]]
+    return sets

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from visadapt.diagnosis import next_experiment
+from visadapt.diagnosis.explanations import first_explanation
 from visadapt.diagnosis.result import (
     AMBIGUOUS,
     IDENTIFIED,
@@ -26,7 +27,6 @@ from visadapt.diagnosis.result import (
     Diagnosis,
     Gap,
     Pixels,
-    first_explanation,
     without_slight,
 )
 from visadapt.diagnosis.search.camera import CameraFindings, find_camera

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from visadapt.diagnosis.explanations import preferred
 from visadapt.effects import EFFECTS, Effect
 from visadapt.effects.own import is_own, own_effects
 from visadapt.systems.base import NAMED
@@ -123,15 +124,6 @@ class Cause:
 def without_slight(causes: Iterable[Cause]) -> list[Cause]:
     """The causes on which the verdict rests."""
     return [cause for cause in causes if not cause.slight]
-
-
-def first_explanation(causes: Iterable[Cause]) -> list[Cause]:
-    """The causes without those that an earlier one cannot be told from."""
-    taken: list[Cause] = []
-    for cause in causes:
-        if not any(cause.effect in (one.effect, *one.indistinguishable_from) for one in taken):
-            taken.append(cause)
-    return taken
 
 
 @dataclass(frozen=True)
@@ -311,7 +303,8 @@ class Diagnosis:
         """The causes as effects at their found values, for a `World` that explains the recording.
 
         Of effects that this recording cannot tell apart the first in `causes` is taken: that of the most probable set,
-        or a twin that does exactly the same. The others are its `indistinguishable_from`.
+        or a twin that does exactly the same. For an error of a sensor one that is none is taken instead, unless errors
+        of sensors are clearly more probable. The others are its `indistinguishable_from`.
 
         Raises:
             ValueError: the diagnosis named no cause (no_gap or unexplained), or a parameter has no finite value.
@@ -329,7 +322,8 @@ class Diagnosis:
         """
         if (kind := NAMED.get(self.system)) is not None and is_own(kind):
             own_effects(kind)  # two systems of one's own may have effects of the same name
-        return named_effects(self.verdict, self.causes)
+        probability = {frozenset(one.effects): one.probability for one in reversed(self.ranking)}
+        return named_effects(self.verdict, preferred(self.causes, probability)[0])
 
     def to_json(self) -> dict[str, Any]:
         """The result as json.dumps takes it; keys and their order are those of `schema.json`, NaN becomes None."""
@@ -337,21 +331,20 @@ class Diagnosis:
 
 
 def named_effects(verdict: str, causes: Sequence[Cause]) -> list[Effect]:
-    """`Diagnosis.effects` of a verdict with its causes."""
+    """The causes of one explanation as effects; the verdict is for the message where there are none."""
     if not causes:
         raise ValueError(
             f"the verdict is {verdict}: the diagnosis named no cause to put into a world; "
             + ("the source explains the recording as it is" if verdict == NO_GAP else "adapt with a residual")
         )
-    taken = first_explanation(causes)
-    for cause in taken:
+    for cause in causes:
         for name, estimate in cause.parameters.items():
             if not math.isfinite(estimate.value):
                 raise ValueError(
                     f"{cause.effect}: the recording does not determine its {name}; record motions that show it, or "
                     "pass the effect with a value of your own"
                 )
-    return [EFFECTS[cause.effect](**{name: one.value for name, one in cause.parameters.items()}) for cause in taken]
+    return [EFFECTS[cause.effect](**{name: one.value for name, one in cause.parameters.items()}) for cause in causes]
 
 
 def _plain(value: Any, is_share: bool = False) -> Any:

@@ -5,17 +5,15 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
-from visadapt.diagnosis.explanations import explanations
+from visadapt.diagnosis.explanations import preferred
 from visadapt.diagnosis.result import SCHEMA_VERSION, Cause, Estimate, named_effects
 from visadapt.effects import EFFECTS, Effect
 from visadapt.effects.catalogue import catalogue
 from visadapt.systems import System
-
-_T = TypeVar("_T")
 
 READABLE = (1, SCHEMA_VERSION)  # Versions of the file in which the causes have the same meaning
 
@@ -46,26 +44,17 @@ def load_effects(path: str | os.PathLike[str], system: System) -> list[Effect]:
     >>> [effect.name for effect in va.load_effects(path.with_suffix(".json"), system)]
     ['constant_force']
     """
-    return _read(path, system, named_effects)
+    return load_explanations(path, system)[0]
 
 
 def load_explanations(path: str | os.PathLike[str], system: System) -> list[list[Effect]]:
-    """The effects of each explanation that a saved diagnosis gives, the likeliest first; several where it is ambiguous.
+    """The effects of each explanation that a saved diagnosis gives, that of `load_effects` first; several where it is
+    ambiguous.
 
     Raises:
         DiagnosisFileError: as `load_effects`.
     """
 
-    def every(verdict: str, causes: Sequence[Cause]) -> list[list[Effect]]:
-        first, *others = explanations(causes)
-        known = [one for one in others if all(math.isfinite(e.value) for c in one for e in c.parameters.values())]
-        return [named_effects(verdict, one) for one in (first, *known)]
-
-    return _read(path, system, every)
-
-
-def _read(path: str | os.PathLike[str], system: System, named: Callable[[str, Sequence[Cause]], list[_T]]) -> list[_T]:
-    """What `named` makes of the verdict and the causes in a file."""
     catalogue(system)  # makes the effects of a system of one's own known, by which a file names them
     try:
         content = json.loads(Path(path).read_text(encoding="utf-8"))
@@ -84,7 +73,11 @@ def _read(path: str | os.PathLike[str], system: System, named: Callable[[str, Se
         for cause in causes:
             if cause.effect not in EFFECTS:
                 raise ValueError(f"names {cause.effect}, which is not known here: give the file that defines it")
-        return named(content["verdict"], causes)
+        ranking = reversed(content.get("ranking", ()))
+        probability = {frozenset(one["effects"]): float(one["probability"]) for one in ranking}
+        first, *others = preferred(causes, probability)
+        known = [one for one in others if all(math.isfinite(e.value) for c in one for e in c.parameters.values())]
+        return [named_effects(content["verdict"], one) for one in (first, *known)]
     except (KeyError, TypeError, AttributeError) as error:
         raise DiagnosisFileError(f"{path}: not a whole diagnosis: {error}") from error
     except (ValueError, OverflowError) as error:

@@ -18,7 +18,7 @@ from visadapt.diagnosis.planning import plan
 from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, UNEXPLAINED
 from visadapt.diagnosis.saved import load_explanations
 from visadapt.diagnosis.words import DERIVED, OPPOSITE, listed
-from visadapt.effects import Effect, SensingEffect
+from visadapt.effects import Effect
 from visadapt.learning.explanation import Explain, Explanation
 from visadapt.policies import Policy
 from visadapt.progress import Report, staged
@@ -36,10 +36,6 @@ at once, what it does before says little."""
 OPPOSITE_ERROR = 0.25
 """Mean square error of single steps with the opposite sign, over that with the source's, below which the target's sign
 is the opposite one."""
-
-CLEARLY_LESS = 0.5
-"""Ratio of the probability that all sensors are right to that of a wrong one, among explanations that fit alike, down
-to which the sensors are believed."""
 
 WORTH_NAMING = 0.5  # Share of an unexplained gap from which on the effects that close it are named
 MOST_NAMED = 3  # Effects; a longer list that leaves the gap unexplained says nothing of the machine
@@ -87,8 +83,7 @@ def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, r
         effects: list[Effect] = []
         others: list[list[Effect]] = []
         if verdict in (IDENTIFIED, AMBIGUOUS):
-            sets = _sensors_believed(load_explanations(path, source.system), content["ranking"])
-            effects, *others = _without_repeats(sets, slight)
+            effects, *others = _without_repeats(load_explanations(path, source.system), slight)
         elif verdict == UNEXPLAINED:
             effects = kept_nearest(path, source.system)
 
@@ -112,23 +107,6 @@ def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, r
         )
 
     return explain
-
-
-def _sensors_believed(sets: list[list[Effect]], ranking: Sequence[Mapping[str, Any]]) -> list[list[Effect]]:
-    """Explanations that fit alike, the one by which the policy is tuned first: the likeliest, or the likeliest in which
-    all sensors are right, unless those in which one is wrong are clearly likelier together.
-
-    By the readings a policy is judged: one that is tuned for a wrong sensor where the motor is weak does worse by them
-    than the source policy.
-    """
-    probability = {frozenset(one["effects"]): one["probability"] for one in reversed(ranking)}
-    odds = [probability.get(frozenset(effect.name for effect in each), 0.0) for each in sets]
-    wrong = [any(isinstance(effect, SensingEffect) for effect in each) for each in sets]
-    believed = sum(p for p, is_wrong in zip(odds, wrong, strict=True) if not is_wrong)
-    if not all(wrong) and believed > CLEARLY_LESS * (sum(odds) - believed):
-        first = wrong.index(False)
-        return [sets[first], *sets[:first], *sets[first + 1 :]]
-    return sets
 
 
 def _without_repeats(sets: Sequence[list[Effect]], slight: frozenset[str]) -> list[list[Effect]]:

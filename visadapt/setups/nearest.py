@@ -6,7 +6,8 @@ import math
 from pathlib import Path
 
 from visadapt.diagnosis import Diagnosis
-from visadapt.diagnosis.result import UNEXPLAINED, first_explanation
+from visadapt.diagnosis.explanations import first_explanation
+from visadapt.diagnosis.result import UNEXPLAINED
 from visadapt.diagnosis.saved import DiagnosisFileError
 from visadapt.effects import EFFECTS, ActuationEffect, DynamicsEffect, Effect
 from visadapt.effects.base import Role
