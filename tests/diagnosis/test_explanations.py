@@ -45,11 +45,11 @@ OFFSET, BIAS = "angle_offset", "actuator_bias"
 def test_sensors_are_believed_unless_a_wrong_one_is_clearly_likelier(of_the_offset, first):
     causes = (cause(OFFSET, PUSH, BIAS), cause(PUSH, OFFSET, BIAS), cause(BIAS, OFFSET, PUSH))
     rest = (1 - of_the_offset) / 2
-    probability = {frozenset({OFFSET}): of_the_offset, frozenset({PUSH}): rest, frozenset({BIAS}): rest}
-    sets = [[one.effect for one in each] for each in preferred(causes, probability)]
+    ranking = [((OFFSET,), of_the_offset), ((PUSH,), rest), ((BIAS,), rest)]
+    sets = [[one.effect for one in each] for each in preferred(causes, ranking)]
     assert sets == [[first], *([name] for name in (OFFSET, PUSH, BIAS) if name != first)]
 
 
 def test_of_effects_of_sensors_alone_the_likeliest_is_taken():
     causes = (cause(OFFSET, "position_offset"), cause("position_offset", OFFSET))
-    assert [one.effect for one in preferred(causes, {})[0]] == [OFFSET]
+    assert [one.effect for one in preferred(causes, [])[0]] == [OFFSET]

@@ -105,8 +105,8 @@ def _settings(options: argparse.Namespace, system: System) -> dict[str, str]:
 
 
 def _check_period(path: Path, policy: Policy, period: float) -> None:
-    trained = policy.trained_in["period"] if policy.trained_in else period
-    if abs(trained - period) > PERIOD_TOLERANCE * trained:
+    trained = policy.trained_period
+    if trained is not None and abs(trained - period) > PERIOD_TOLERANCE * trained:
         raise InputError(
             f"{path} was trained for {trained:g} s between commands, the recording has {period:.4g} s: one that was "
             f"trained with --period {period:.4g} is right"

@@ -64,10 +64,7 @@ def load_policy_and_source(options: argparse.Namespace) -> tuple[Policy, World]:
     if options.system and options.system.name != source.system.name:
         raise InputError(f"{options.policy}: a policy of a {source.system.name}; --system is a {options.system.name}")
     if options.system and (changed := _changed(source.system)):
-        print(
-            f"visadapt: {options.policy}: was made with {changed}; the policy's own are used",
-            file=sys.stderr,
-        )
+        print(f"visadapt: {options.policy}: was made with {changed}; the policy's own are used", file=sys.stderr)
     return policy, source
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import TYPE_CHECKING
 
 from visadapt.effects import EFFECTS, SensingEffect
@@ -51,14 +51,18 @@ def explanations(causes: Sequence[Cause]) -> list[list[Cause]]:
     return [first, *exchanged.values()]
 
 
-def preferred(causes: Sequence[Cause], probability: Mapping[frozenset[str], float]) -> list[list[Cause]]:
+def preferred(causes: Sequence[Cause], ranking: Iterable[tuple[Collection[str], float]]) -> list[list[Cause]]:
     """The explanations, the one to simulate and to tune a policy by first: the likeliest, or the likeliest in which all
     sensors are right, unless those in which one is wrong are clearly likelier together.
 
     By its readings a machine is judged: where the motor is weak, a policy that is tuned for a wrong sensor does worse
-    by them than the source policy. `probability` is that of sets of effects, by their names.
+    by them than the source policy. `ranking` has sets of effects, by their names, and their probabilities, the most
+    probable first.
     """
     sets = explanations(causes)
+    probability: dict[frozenset[str], float] = {}
+    for names, p in ranking:
+        probability.setdefault(frozenset(names), p)
     odds = [probability.get(frozenset(cause.effect for cause in each), 0.0) for each in sets]
     wrong = [any(issubclass(EFFECTS[cause.effect], SensingEffect) for cause in each) for each in sets]
     believed = sum(p for p, is_wrong in zip(odds, wrong, strict=True) if not is_wrong)

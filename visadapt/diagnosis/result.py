@@ -322,8 +322,8 @@ class Diagnosis:
         """
         if (kind := NAMED.get(self.system)) is not None and is_own(kind):
             own_effects(kind)  # two systems of one's own may have effects of the same name
-        probability = {frozenset(one.effects): one.probability for one in reversed(self.ranking)}
-        return named_effects(self.verdict, preferred(self.causes, probability)[0])
+        ranking = ((one.effects, one.probability) for one in self.ranking)
+        return named_effects(self.verdict, preferred(self.causes, ranking)[0])
 
     def to_json(self) -> dict[str, Any]:
         """The result as json.dumps takes it; keys and their order are those of `schema.json`, NaN becomes None."""

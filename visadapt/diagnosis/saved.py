@@ -54,7 +54,6 @@ def load_explanations(path: str | os.PathLike[str], system: System) -> list[list
     Raises:
         DiagnosisFileError: as `load_effects`.
     """
-
     catalogue(system)  # makes the effects of a system of one's own known, by which a file names them
     try:
         content = json.loads(Path(path).read_text(encoding="utf-8"))
@@ -73,9 +72,8 @@ def load_explanations(path: str | os.PathLike[str], system: System) -> list[list
         for cause in causes:
             if cause.effect not in EFFECTS:
                 raise ValueError(f"names {cause.effect}, which is not known here: give the file that defines it")
-        ranking = reversed(content.get("ranking", ()))
-        probability = {frozenset(one["effects"]): float(one["probability"]) for one in ranking}
-        first, *others = preferred(causes, probability)
+        ranking = ((one["effects"], float(one["probability"])) for one in content.get("ranking", ()))
+        first, *others = preferred(causes, ranking)
         known = [one for one in others if all(math.isfinite(e.value) for c in one for e in c.parameters.values())]
         return [named_effects(content["verdict"], one) for one in (first, *known)]
     except (KeyError, TypeError, AttributeError) as error:

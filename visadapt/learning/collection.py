@@ -31,7 +31,7 @@ class Kept:
     def load(self, generator: torch.Generator) -> list[Episode]:
         """The episodes kept so far; `generator` goes on from the last of them."""
         episodes = []
-        for path in sorted(self.folder.glob("*.safetensors")):
+        for path in self._files():
             tree = load_tree(path)
             with fitting(path):
                 arrays: dict[str, Any] = {
@@ -43,7 +43,7 @@ class Kept:
 
     def cut(self) -> list[int]:
         """Which of them, from 0 on, end where the target failed."""
-        return [k for k, path in enumerate(sorted(self.folder.glob("*.safetensors"))) if path.stem.endswith(CUT)]
+        return [number for number, path in enumerate(self._files()) if path.stem.endswith(CUT)]
 
     def add(self, number: int, episode: Episode, generator: torch.Generator, cut: bool) -> None:
         """Keep the episode of this number; `cut`: it ends where the target failed."""
@@ -55,6 +55,9 @@ class Kept:
     def remove(self) -> None:
         """Once the episodes are written elsewhere."""
         shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _files(self) -> list[Path]:
+        return sorted(self.folder.glob("*.safetensors"))
 
 
 def collect(

@@ -60,6 +60,11 @@ class Policy(nn.Module):
         self.residual: Residual | None = None
 
     @property
+    def trained_period(self) -> float | None:
+        """s between the commands that it was trained for; None where that is not known."""
+        return self.trained_in["period"] if self.trained_in else None
+
+    @property
     def command_range(self) -> tuple[Tensor, Tensor]:
         """Lowest and highest commands, (n_action,) each; -1 and 1, unless a subclass has others."""
         most = self.feedforward.weight.new_ones(self.n_action)

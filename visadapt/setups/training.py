@@ -286,8 +286,8 @@ def setup_to_adapt(
         elif with_history and not torch.equal(references.as_many().positions, own.positions):
             raise ValueError("the target has references of its own, from which histories start: give no others")
     setup = setup_for(source, policy, renderer, references, with_history)
-    trained = policy.trained_in["period"] if policy.trained_in else source.period
-    if periods_differ(trained, source.period):
+    trained = policy.trained_period
+    if trained is not None and periods_differ(trained, source.period):
         raise ValueError(
             f"the policy was trained for {trained:g} s between commands, the world is stepped every "
             f"{source.period:g} s: World(..., period={trained:g}) is right"

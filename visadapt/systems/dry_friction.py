@@ -75,7 +75,7 @@ def _stopped(
 ) -> Tensor:
     """`stopped` for rows in each of which something reverses, with the limits (B, n_load, 2) on coordinates at rest and
     on those that have started, and the change (B, n_state) of all rates per unit of each load that rubs, by index."""
-    outside = system.outside_joints()
+    velocities, outside = [velocity for _, velocity in system.coordinates], system.outside_joints()
     for k, gain in responses.items():
         own = system.coordinates[k][1]
         forward, backward = at_rest[:, k].unbind(-1)
@@ -97,7 +97,6 @@ def _stopped(
             moved[:, position] = moved[:, position] + 0.5 * left * h * gain[:, velocity] * impulse
         moved[:, own] = torch.where(reverses, kept, last)  # exactly at rest
         if outside:  # what flows or is induced with the motion, as a cylinder's pressure or a motor's current
-            velocities = [velocity for _, velocity in system.coordinates]
             slower = after.clone()
             slower[:, velocities] = moved[:, velocities]
             rates = _free(system, slower, command) - _free(system, after, command)

@@ -132,8 +132,8 @@ def run(
 
 def check_period(policy: Policy, target: Target) -> None:
     """Raises ValueError where the policy is known to be trained for another period than the target's."""
-    trained = policy.trained_in["period"] if policy.trained_in else target.period
-    if periods_differ(trained, target.period):
+    trained = policy.trained_period
+    if trained is not None and periods_differ(trained, target.period):
         raise ValueError(
             f"{target.name} has {target.period:g} s between actions, the policy was trained for {trained:g} s: give "
             "the target that period, or train a policy for its own"
