@@ -10,7 +10,7 @@ from visadapt.diagnosis import excitations, planning
 from visadapt.diagnosis.result import SCHEMA_VERSION
 from visadapt.effects import EFFECTS
 from visadapt.recordings import read_recording
-from visadapt.setups.explained import explained
+from visadapt.setups.explained import doubts, explained
 from visadapt.setups.nearest import kept_nearest
 from visadapt.storage.run_folder import read_json, write_json
 from visadapt.targets import TargetError, synthetic
@@ -95,6 +95,32 @@ def test_a_command_of_the_opposite_sign_is_refused_where_no_episode_is_long_enou
     assert not found.complete
     with pytest.raises(TargetError, match=r"turned\.h5: command of the target has the opposite sign .* scale = -1\.0"):
         explain([tmp_path / "turned.h5"], tmp_path / "turned.json")
+
+
+@pytest.mark.parametrize(("rows", "factors", "problem"), [
+    (150, [1, 1, 180 / np.pi, 180 / np.pi], r"rad/s; radians are right \(these look like degrees\)"),
+    (8, [1000, 1000, 1, 1], r"m/s; metres are right \(these look like centimetres or millimetres\)"),
+])  # fmt: skip
+def test_readings_in_another_unit_are_to_be_mended_in_the_target(tmp_path, rows, factors, problem):
+    policy, generator = va.load_policy(va.shipped("cartpole_states")), torch.Generator().manual_seed(0)
+    runs = va.run(va.SyntheticTarget(), policy, 2, rows, generator, exploration=0.3)
+    episodes = [replace(run.episode, state=run.episode.state * np.array(factors)) for run in runs]
+    va.write_recording(tmp_path / "run.h5", episodes, [state.name for state in va.CartPole.states], ["command"])
+    source = va.World(va.CartPole())
+    with pytest.raises(TargetError, match=problem) as refused:
+        explained(source)([tmp_path / "run.h5"], tmp_path / "found.json")
+    assert str(refused.value).endswith("mend it in the target, or its map, and begin in another folder")
+    assert "--columns" not in str(refused.value)
+    assert doubts([tmp_path / "run.h5"], episodes, source) == [str(refused.value)]
+
+
+def test_nothing_is_doubted_of_a_target_that_shows_what_the_source_has(tmp_path):
+    policy, source = va.load_policy(va.shipped("cartpole_states")), va.World(va.CartPole())
+    for rows in (8, 150):
+        runs = va.run(va.SyntheticTarget(), policy, 2, rows, torch.Generator().manual_seed(0), exploration=0.3)
+        episodes = [run.episode for run in runs]
+        va.write_recording(tmp_path / f"{rows}.h5", episodes)
+        assert doubts([tmp_path / f"{rows}.h5"], episodes, source) == []
 
 
 class Creep(va.DynamicsEffect):

@@ -16,11 +16,11 @@ from visadapt.cli.run_folders import run_settings
 from visadapt.cli.simulator import given_effects
 from visadapt.cli.target import load_policy_and_target
 from visadapt.cli.user_code import as_input_error
-from visadapt.diagnosis.words import OPPOSITE, listed, number, with_unit
+from visadapt.diagnosis.words import number, with_unit
 from visadapt.effects import Effect, Parameter
 from visadapt.learning.explanation import Explanation
 from visadapt.policies import ImagePolicy
-from visadapt.setups.explained import check_diagnosable, opposite_commands
+from visadapt.setups.explained import check_diagnosable, doubts
 from visadapt.setups.policy_file import save_policy
 from visadapt.setups.training import adapt, setup_to_adapt
 from visadapt.storage.run_folder import alone_in, open_run, write_json
@@ -68,8 +68,9 @@ def run(options: argparse.Namespace) -> None:
         print(_in_words(last))
         for warning in last.warnings:
             print(f"Warning    {warning}")
-    elif policy.shown == "state" and (turned := opposite_commands(adapted.episodes, source)):
-        print(f"Warning    {listed(turned)} of the target{OPPOSITE}, by single steps; --diagnose checks what it shows")
+    elif policy.shown == "state":
+        for doubt in doubts(sorted(folder.glob("round-*/recording.h5")), adapted.episodes, source):
+            print(f"Warning    {doubt}")
     if adapted.taken_back:
         tuned = copy.deepcopy(adapted.policy)
         adapted.restore(tuned, adapted.rounds[-1].samples)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -17,6 +18,8 @@ from visadapt.systems import System
 Note = Callable[[str, str], None]
 """Called with (what was changed or left out, where in the recording)."""
 
+CONVERSION = re.compile(r"; --columns [^;]+? converts| \(--columns [^)]+\)")
+"""How a message says that a file's column is converted: `RawEpisode.conversion`, and the check of a vehicle's axes."""
 GAP_PERIODS = 1.5
 """Step, in periods, above which rows are missing."""
 LATER_PERIODS = 0.5

@@ -22,8 +22,10 @@ from visadapt.effects import Effect
 from visadapt.learning.explanation import Explain, Explanation
 from visadapt.policies import Policy
 from visadapt.progress import Report, staged
-from visadapt.recordings import Episode, load_recording
+from visadapt.recordings import Episode, Recording, RecordingError, load_recording
+from visadapt.recordings.clock import CONVERSION
 from visadapt.recordings.hdf5 import read_stretches
+from visadapt.recordings.loading import TOO_SHORT
 from visadapt.setups.nearest import keep_nearest, kept_nearest
 from visadapt.storage.run_folder import read_json, write_json
 from visadapt.targets.base import TargetError
@@ -52,10 +54,8 @@ def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, r
 
     Raises:
         ValueError: the source has effects, which a diagnosis would have to know.
-        RecordingError: from what is returned, as the next one: the target's units, or the order of its states, are
-            wrong.
-        TargetError: the target shows or takes something with the opposite sign, with which the policy would drive it
-            the wrong way.
+        TargetError: from what is returned: the target's units, or the order of its states, are wrong, or it shows or
+            takes something with the opposite sign, with which the policy would drive it the wrong way.
     """
     if len(source.effects):
         raise ValueError("a diagnosis starts from the bare system: give the source without effects")
@@ -65,11 +65,11 @@ def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, r
         episodes = [one for each in recordings for one in read_stretches(each, frames=False)[0].values()]
         short, every = _samples(episodes, shortest)
         if short > MOST_SHORT * every:
-            if renderer is None and (turned := opposite_commands(episodes, source)):
-                raise _opposite(recordings[0], listed(turned))
+            if renderer is None:
+                _check_short(recordings, episodes, source)
             verdict = f"{short} of {every} samples are in episodes shorter than {shortest:g} s, not diagnosed"
             return Explanation(verdict, [], complete=False)
-        recording = load_recording(recordings, source.system, frames=renderer is not None)
+        recording = _load(recordings, source, frames=renderer is not None)
         diagnosed = partial(diagnose, recording, source, seed=seed, progress=report, renderer=renderer)
         found = None
         if not path.exists():
@@ -107,6 +107,39 @@ def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, r
         )
 
     return explain
+
+
+def _load(recordings: Sequence[Path], source: World, frames: bool = False) -> Recording:
+    """The recordings of a target, whose readings are converted where it is defined, not where they are read."""
+    try:
+        return load_recording(recordings, source.system, frames=frames)
+    except RecordingError as error:
+        problem = CONVERSION.sub("", str(error))
+        raise TargetError(f"{problem}; mend it in the target, or its map, and begin in another folder") from error
+
+
+def _check_short(recordings: Sequence[Path], episodes: Sequence[Episode], source: World) -> None:
+    """Raises TargetError where episodes that are too short for a diagnosis show a wrong unit or an opposite sign."""
+    if turned := opposite_commands(episodes, source):
+        raise _opposite(recordings[0], listed(turned))
+    try:
+        _load(recordings, source)
+    except TargetError as error:
+        if TOO_SHORT not in str(error):
+            raise
+
+
+def doubts(recordings: Sequence[Path], episodes: Sequence[Episode], source: World) -> list[str]:
+    """What a target seems to show or take otherwise than the source: signs, units, exchanged or dead readings.
+
+    A quick check, for where no diagnosis is asked for; in words."""
+    if turned := opposite_commands(episodes, source):
+        return [f"{listed(turned)} of the target{OPPOSITE}, by single steps; --diagnose checks what it shows"]
+    try:
+        found = _load(recordings, source).warnings
+    except TargetError as error:
+        found = (str(error),)
+    return [each for each in found if TOO_SHORT not in each]
 
 
 def _without_repeats(sets: Sequence[list[Effect]], slight: frozenset[str]) -> list[list[Effect]]:
