@@ -13,7 +13,7 @@ from visadapt.systems import System
 
 MOTIONS: dict[Stage, str] = {
     Stage.ACTUATION: "steps and chirps of the command over its whole range",
-    Stage.DYNAMICS: "free motions with the motor off, slow and fast, over the whole range of positions",
+    Stage.DYNAMICS: "free motions with the motor off, slow and fast, as far as the machine can be left to itself",
     Stage.SENSING: "known positions and angles, set by hand and held still",
     Stage.CAMERA: "a card with marks at known places, held still before the camera",
 }
@@ -84,7 +84,7 @@ def separate(classes: Sequence[Collection[type[Effect]]], system: System) -> str
                     settled |= {name, other}
         if len(names) > 1:
             every = settled == set(names)
-            general = f"{_general(members, profile_of(system))}, or the experiment that --plan designs"
+            general = f"{_general(members, profile_of(system))}; --plan says whether commands alone would do"
             advice = experiments if every else [*experiments, general]
             parts.append(f"To tell {listed(names)} apart: " + "; ".join(advice) + ".")
     return " ".join(parts)
