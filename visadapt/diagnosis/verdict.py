@@ -29,8 +29,11 @@ LEAST_UNCHANGED = 0.01
 """Probability of the unchanged simulator below which a recording without a gap within a prediction has one in the long
 run."""
 CLEAR_OF_NOISE = 3.0
-"""Ratio of prediction error to measurement noise above which there is a gap. Where the ratio with the causes is still
-above it, the share of the gap that they close decides the verdict."""
+"""Ratio of prediction error to measurement noise above which there is a gap, also where no cause is found."""
+
+LOW_NOISE = 20.0
+"""Ratio of the source's prediction error to measurement noise above which any model of a real machine leaves something
+significant: the share of the gap that the causes close then decides the verdict."""
 
 HOVERING = 0.2  # m/s, root mean square of a vehicle's speed up to which it hardly moves
 
@@ -66,10 +69,9 @@ def verdict_of(
     if math.isnan(gap.closed) and not repeats:
         return nothing  # the source predicts as well as the noise allows
     if unexplained:
-        # Where the noise is low, any model of a real machine leaves something significant: then the share of the gap
-        # that is closed decides, otherwise whether what is unexplained is negligible.
-        clear = gap.after > CLEAR_OF_NOISE * gap.floor
-        enough = gap.closed >= MIN_GAP_CLOSED if clear else comparison.negligible and not improvable
+        enough = comparison.negligible and not improvable
+        if gap.before > LOW_NOISE * gap.floor:
+            enough = gap.closed >= MIN_GAP_CLOSED
         if not (comparison.best.effects and enough):
             return UNEXPLAINED
     carrying = without_slight(explaining)

@@ -17,6 +17,7 @@ from visadapt.diagnosis import diagnose
 from visadapt.diagnosis.planning import plan
 from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, UNEXPLAINED
 from visadapt.diagnosis.saved import load_explanations
+from visadapt.diagnosis.verdict import CLOSES_BUT
 from visadapt.diagnosis.words import DERIVED, OPPOSITE, listed
 from visadapt.effects import Effect
 from visadapt.learning.explanation import Explain, Explanation
@@ -99,7 +100,8 @@ def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, r
             return torch.as_tensor(planned.added)
 
         # A policy that is shown derived velocities acts on what no effect in the world stands for.
-        complete = verdict != UNEXPLAINED and not any(DERIVED in warning for warning in content["warnings"])
+        left = any(DERIVED in warning or warning.startswith(CLOSES_BUT) for warning in content["warnings"])
+        complete = verdict != UNEXPLAINED and not left
         designs = experiment if verdict == AMBIGUOUS and renderer is None else None
         nearest = _nearest(content["ranking"]) if verdict == UNEXPLAINED and not effects else ""
         return Explanation(
