@@ -10,8 +10,12 @@ import torch
 from tests.own_systems import Pendulum
 from visadapt.diagnosis import diagnose
 from visadapt.diagnosis.report.html import as_html
+from visadapt.diagnosis.search.heldout import held_out
+from visadapt.diagnosis.search.preparation import prepare
+from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.words import plain
 from visadapt.effects.catalogue import catalogue
+from visadapt.estimation.fit_states import with_effect
 from visadapt.recordings import Episode, Recording, RecordingError, load_recording, write_recording
 from visadapt.systems import Variable
 from visadapt.world import World
@@ -165,3 +169,28 @@ def test_a_machine_that_moves_slowly_is_diagnosed_as_a_fast_one():
     expected = diagnose(fast, World(Pendulum(), period=PERIOD), IMITATING)
     assert found.gap.before == pytest.approx(expected.gap.before, rel=0.02)
     assert found.gap.closed == pytest.approx(expected.gap.closed, abs=0.01)
+
+
+@dataclass(frozen=True)
+class Balanced(Pendulum):
+    """A pendulum that has no inertia left where `counterweight` is 1 or more."""
+
+    counterweight: float | torch.Tensor = 0.5
+
+    name = "balanced"
+
+    def derivative(self, state, command, load):
+        rate, acceleration = super().derivative(state, command, load).unbind(-1)
+        return torch.stack((rate, acceleration / (1 - torch.as_tensor(self.counterweight)).sqrt()), -1)
+
+
+def test_a_set_that_cannot_be_simulated_predicts_badly_and_does_not_end_the_diagnosis():
+    system = Balanced()
+    rows = prepare(recording(), system).rows
+    (scale,) = (effect for effect in catalogue(system) if effect.name == "counterweight.scale")
+    source = Search(system, rows, [scale]).source.fits
+    right, impossible = (with_effect(source, [factor]) for factor in (1.0, 3.0))
+    sets = [((scale,), fits) for fits in (right, impossible)]
+    expected, errors = held_out(system, rows, sets, lambda errors: errors.rms(torch.ones(2).double()))
+    assert errors.isfinite().all()
+    assert (errors[-1] > 10 * expected[-1]).all()

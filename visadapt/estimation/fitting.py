@@ -126,7 +126,8 @@ def refitted(model: CandidateModel, fits: FitState, window_used: Tensor) -> FitS
     low, high = (end[copied] for end in _bounds([model], fits))
     widths = (high - low).clamp(min=1e-300)
     information = whole.summed(torch.ones_like(window_used)).information + torch.diag_embed((2 / widths).square())
-    most = MAX_REFIT_CHANGE * torch.linalg.inv(information).diagonal(dim1=1, dim2=2).sqrt()
+    spread = torch.linalg.inv_ex(information).inverse.diagonal(dim1=1, dim2=2).sqrt()
+    most = MAX_REFIT_CHANGE * spread.nan_to_num(math.inf)  # of a set that cannot be simulated, nothing is known
     bounds = torch.maximum(low, copies.theta - most), torch.minimum(high, copies.theta + most)
     damping = torch.full((len(copied),), FIRST_DAMPING, dtype=torch.float64)
     return replace(_step(copies, at, damping, bounds, model), state=copies.state, likelihood=at.likelihood)

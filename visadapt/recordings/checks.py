@@ -21,6 +21,7 @@ from visadapt.recordings.physics import (
     are_degrees,
     correlation,
     exchanged,
+    exchanged_commands,
     is_half_a_turn_off,
     is_turned_round,
     rows_apart,
@@ -165,6 +166,12 @@ def _check_answers(judged: Sequence[RawEpisode], system: System, angles: Sequenc
                 f"{whole.column(other)} as {name}: they are exchanged "
                 "(or the command's sign is wrong: positive pushes towards +x)"
             )
+    if not isinstance(system, RigidBody) and (commands := exchanged_commands(judged, system)):
+        one, other = commands
+        raise RecordingError(
+            f"{whole.origin}: {whole.column(one)} moves what {other} should, and {whole.column(other)} what {one} "
+            f"should: they are exchanged{whole.exchange(one, other)}"
+        )
 
 
 def _rates(time: NDArray[np.float64], values: NDArray[np.float64], angle: bool) -> NDArray[np.float64]:

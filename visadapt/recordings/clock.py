@@ -117,6 +117,13 @@ class RawEpisode:
             return ""
         return f"; --columns {name}={self.given.get(name) or self.names[name]}{how} converts"
 
+    def exchange(self, one: str, other: str) -> str:
+        """The end of a message: how a user has two variables exchange their columns; empty where no file's is read."""
+        if one not in self.names or other not in self.names:
+            return ""
+        columns = {name: self.given.get(name) or self.names[name] for name in (one, other)}
+        return f"; --columns {one}={columns[other]},{other}={columns[one]} converts"
+
     def cell(self, row: int, name: str) -> str:
         """Where in the file a value stands, for messages."""
         return f"{self.origin}: {self.place(row)}, {self.column(name)}"

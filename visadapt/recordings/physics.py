@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -156,7 +158,42 @@ def exchanged(episodes: Sequence[RawEpisode], system: System, one: str, other: s
     latest = round(LONGEST_DELAY * system.prediction_time / period)
     unchanged = [correlations(agreements(episodes, system, delay=k * period)) for k in range(latest + 1)]
     explained = min(correlations(crossed))
-    return explained > EXPLAINED_CORRELATION and max(map(min, unchanged)) < 0.7 * explained and max(unchanged[0]) < 0
+    return (
+        explained > EXPLAINED_CORRELATION
+        and max(map(min, unchanged)) < 0.7 * explained
+        and max(unchanged[0]) < 0
+    )
+
+
+def exchanged_commands(episodes: Sequence[RawEpisode], system: System) -> tuple[str, str] | None:
+    """Two commands of one unit with which the source explains every acceleration if they are exchanged, and not as they
+    are, late, or with other signs; None where there are none, or where that cannot be decided."""
+    names = [variable.name for variable in system.states if system.rate_of(variable.name)]
+    actions = list(enumerate(system.actions))
+    pairs = [(i, k) for (i, one), (k, other) in combinations(actions, 2) if one.unit == other.unit]
+    if not pairs or not can_decide(episodes, system, names):
+        return None
+    identity = np.eye(len(actions))
+
+    def error(commands: NDArray[np.float64], delay: float = 0.0) -> float:
+        changed = [replace(raw, action=raw.action @ commands) for raw in episodes]
+        return max(one.error for one in agreements(changed, system, delay=delay).values())
+
+    def crossed(i: int, k: int) -> NDArray[np.float64]:
+        order = list(range(len(actions)))
+        order[i], order[k] = k, i
+        return identity[order]
+
+    there, (i, k) = min((error(crossed(*pair)), pair) for pair in pairs)
+    if there >= EXPLAINED_ERROR:
+        return None
+    signs = (-identity, *(identity - 2 * np.diag(row) for row in identity))
+    period = min(_period(raw) for raw in episodes)
+    latest = round(LONGEST_DELAY * system.prediction_time / period)
+    others = [error(identity, late * period) for late in range(latest + 1)] + [error(each) for each in signs]
+    if min(others) <= OTHERS_ERROR_RATIO * there:
+        return None
+    return system.actions[i].name, system.actions[k].name
 
 
 def _only_angle(episodes: Sequence[RawEpisode], system: System) -> str | None:

@@ -222,9 +222,11 @@ def alone(cause: Cause) -> str:
     """What a cause closes by itself, and what opens again without it, where that is known."""
     said, of = "", " of the pixels' misfit" if _in_pixels(cause) else ""
     if math.isfinite(cause.gap_closed):
-        said += f", closes {closed(cause.gap_closed)}{of} alone"
+        larger = round(cause.gap_closed, 2) < 0
+        said += ", alone makes the gap larger" if larger else f", closes {closed(cause.gap_closed)}{of} alone"
     if math.isfinite(cause.gap_reopened):
-        said += f", without it {percent(cause.gap_reopened)} opens again"
+        share = "more than the whole gap" if round(cause.gap_reopened, 2) > 1 else percent(cause.gap_reopened)
+        said += f", without it {share} opens again"
     return said
 
 

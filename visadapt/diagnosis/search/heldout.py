@@ -212,7 +212,8 @@ def rollout_errors(
         loads = black_box.loads(inputs(model, fits.state[0])[:, :-1, None]) * rows.inside[:, 1:, None, None]
         problem = replace(problem, drive=problem.drive + (loads_of(model, fits) * loads).sum(-1, keepdim=True))
     smoothed, _ = backward(forward(problem, *variances(model, fits, problem)))
-    estimated = fits.state[0] + smoothed[..., 0]
+    # A set that cannot be simulated, with a mass matrix that is singular, say, is predicted from where it was fitted.
+    estimated = fits.state[0] + smoothed[..., 0].nan_to_num(0, 0, 0)
     predicted = _rollouts(model, fits.theta[0], estimated, horizon, stride, black_box)
 
     measured, shown = model.shown(fits.theta[0])
