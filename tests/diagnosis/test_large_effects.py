@@ -7,9 +7,9 @@ import torch
 
 import visadapt as va
 from tests.diagnosed import record
-from visadapt.diagnosis.verdict import CLOSES_BUT
 from visadapt.diagnosis.search.preparation import prepare
 from visadapt.diagnosis.search.search import Search
+from visadapt.diagnosis.verdict import CLOSES_BUT
 from visadapt.effects import (
     EFFECTS,
     CartMass,

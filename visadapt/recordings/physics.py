@@ -36,7 +36,8 @@ EXPLAINED_CORRELATION = 0.5
 """Correlation of measured and predicted accelerations above which the source explains them."""
 
 TURNS = ("omega_x", "omega_y", "omega_z")
-"""Rates of turn of a vehicle, which are no variable's rate, and whose changes are judged as accelerations are."""
+"""Rates of turn of a vehicle, which are no variable's rate, and whose changes are judged as accelerations are; so are a
+joint's speeds without a position."""
 
 Columns = Mapping[str, NDArray[np.float64]]
 
@@ -158,11 +159,7 @@ def exchanged(episodes: Sequence[RawEpisode], system: System, one: str, other: s
     latest = round(LONGEST_DELAY * system.prediction_time / period)
     unchanged = [correlations(agreements(episodes, system, delay=k * period)) for k in range(latest + 1)]
     explained = min(correlations(crossed))
-    return (
-        explained > EXPLAINED_CORRELATION
-        and max(map(min, unchanged)) < 0.7 * explained
-        and max(unchanged[0]) < 0
-    )
+    return explained > EXPLAINED_CORRELATION and max(map(min, unchanged)) < 0.7 * explained and max(unchanged[0]) < 0
 
 
 def exchanged_commands(episodes: Sequence[RawEpisode], system: System) -> tuple[str, str] | None:
@@ -242,7 +239,7 @@ def agreements(
     changed: Callable[[Columns], Columns] = _unchanged,
     delay: float = 0.0,
 ) -> dict[str, Agreement]:
-    """For each variable with a rate, and each rate of turn: how its acceleration follows the source's.
+    """For each variable with a rate, and each rate or speed of no variable: how its acceleration follows the source's.
 
     `changed` gives the measured states the units and names to be tried; `delay` is by how many s the commands
     act late.
@@ -290,7 +287,8 @@ def _accelerations(
         if rate in columns:
             measured.append((columns[rate][2 * stride :] - columns[rate][: -2 * stride]) / span)
         found[name] = np.stack(measured), predicted[:, names.index(rate)]
-    for name in sorted({*TURNS} & {*columns}):
+    speeds = {names[velocity] for position, velocity in system.coordinates if position is None}
+    for name in sorted({*TURNS, *speeds} & {*columns}):
         measured = [(columns[name][2 * stride :] - columns[name][: -2 * stride]) / span]
         found[name] = np.stack(measured), predicted[:, names.index(name)]
     return found
