@@ -12,11 +12,15 @@ import visadapt as va
 from tests.diagnosed import record
 from tests.own_systems import DoublePendulum, Motor
 from visadapt.diagnosis import diagnose
+from visadapt.diagnosis.result import Push
 from visadapt.diagnosis.search.preparation import prepare
+from visadapt.diagnosis.search.pushed_rows import depart_from
 from visadapt.diagnosis.search.pushes import pushes
+from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.search.unexplained_load import load_tracks, unread_states
 from visadapt.effects import ActuatorLag, ActuatorSaturation, CoulombFriction, DynamicsEffect
 from visadapt.effects.catalogue import catalogue
+from visadapt.estimation.candidate import CandidateModel
 from visadapt.recordings import Episode, Recording
 from visadapt.systems import CartPole
 from visadapt.world import World
@@ -346,3 +350,18 @@ def test_a_lagging_motor_goes_on_through_rows_that_were_not_read():
     assert len(tracks) == 2
     for track in tracks:
         assert float((track.load * track.unit)[:, 0].abs().max()) < 1.0  # N
+
+
+def test_a_push_is_none_where_every_row_is_as_predicted():
+    """By the readings of a quiet cart, and of one whose velocity jumps by ten times the noise."""
+    push = Push(1, "force", 1.0, 1.5, 3.0, "N", 0.5, (0.4, 0.6), 1e-9)
+    states = [state.name for state in CartPole.states]
+    quiet = record(measured=states, noise=(1e-3,) * 4)
+    pushed = [episode.state.copy() for episode in quiet.episodes]
+    pushed[1][24:26, 1] += 0.01
+    episodes = [dataclasses.replace(e, state=state) for e, state in zip(quiet.episodes, pushed, strict=True)]
+    for recording, kept in ((quiet, ()), (dataclasses.replace(quiet, episodes=tuple(episodes)), (push,))):
+        rows = prepare(recording, CartPole()).rows
+        fits = Search(CartPole(), rows, []).source.fits
+        assert depart_from(CandidateModel(CartPole(), [], rows), fits, [push]) == kept
+        assert depart_from(CandidateModel(CartPole(), [], rows), fits, [dataclasses.replace(push, episode=0)]) == ()

@@ -11,13 +11,14 @@ from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, UNEXPLAINED, Cause,
 from visadapt.diagnosis.search.causes import causes
 from visadapt.diagnosis.search.fitted_models import ScoredModel
 from visadapt.diagnosis.search.passing_loads import passing_loads
-from visadapt.diagnosis.search.pushed_rows import share_left_out
+from visadapt.diagnosis.search.pushed_rows import depart_from, share_left_out
 from visadapt.diagnosis.search.pushes import pushes
 from visadapt.diagnosis.search.repeated_causes import errors_with_repeats
 from visadapt.diagnosis.search.unexplained import SmoothFunction
 from visadapt.diagnosis.search.unexplained_load import has_joints
 from visadapt.diagnosis.verdict import left_by_source, verdict_of
 from visadapt.effects import Effect
+from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.episode_phases import has_episode_phases, in_episode
 from visadapt.progress import Report, staged
 from visadapt.recordings import Recording
@@ -106,9 +107,11 @@ def _answer(
     source_leaves = [] if found else left_by_source(search)
     # Where the causes explain the recording, the pushes are those beyond them.
     beyond = (comparison.best, comparison.functions) if found else (search.source, source_leaves)
-    return Answer(
-        explored, measured, verdict, found, partial, source_leaves, finder.pushes_beyond(explored, *beyond), aside
-    )
+    passing = finder.pushes_beyond(explored, *beyond)
+    if found and not aside and not comparison.unexplained(measured.improvable):
+        model = CandidateModel(search.system, comparison.best.effects, search.rows)
+        passing = depart_from(model, comparison.predicting, passing)
+    return Answer(explored, measured, verdict, found, partial, source_leaves, passing, aside)
 
 
 def _hiding(unexplained: Answer, finder: _PushFinder) -> tuple[Push, ...]:

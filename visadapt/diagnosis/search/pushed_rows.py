@@ -1,4 +1,4 @@
-"""Rows within pushes, which are set aside where pushes hide what else acts."""
+"""Rows within pushes: they are set aside where pushes hide what else acts, and must depart from what is predicted."""
 
 from __future__ import annotations
 
@@ -9,11 +9,39 @@ import torch
 from torch import Tensor
 
 from visadapt.diagnosis.result import Push
+from visadapt.estimation.candidate import CandidateModel
+from visadapt.estimation.kalman import forward
+from visadapt.estimation.likelihood import FitState, linear_problem, variances
 from visadapt.estimation.segments import stretches_without
 from visadapt.recordings import Recording
 from visadapt.systems import System
 
 MARGIN = 0.1  # Prediction times before and after a push that are set aside with it: its ends are not known exactly
+
+WITHIN_NOISE = 0.01
+"""Probability of innovations as large as those during a push, above which the noise alone gives them."""
+
+
+def depart_from(model: CandidateModel, fits: FitState, pushes: Sequence[Push]) -> tuple[Push, ...]:
+    """The pushes in whose rows the readings depart from what a fitted set predicts, by more than its noise.
+
+    Loads are found in accelerations over several rows. Where a joint turns fast, these are not exact, and a load may
+    seem to act although every row is as predicted.
+    """
+    if not pushes:
+        return ()
+    problem = linear_problem([model], fits).data()
+    innovations = forward(problem, *variances(model, fits, problem)).white[..., 0].square() * model.rows.used
+    return tuple(push for push in pushes if _departs(model, innovations, push))
+
+
+def _departs(model: CandidateModel, squared: Tensor, push: Push) -> bool:
+    """Whether innovations (W, T, m), squared and over their variance, are too large for noise during a push."""
+    rows = model.rows
+    during = (rows.episode == push.episode)[:, None] & (rows.inside > 0)
+    during &= (rows.time >= push.start) & (rows.time <= push.end + rows.period)
+    half = rows.used[during].sum() / 2
+    return bool(torch.special.gammaincc(half.clamp(min=0.5), squared[during].sum() / 2) < WITHIN_NOISE)
 
 
 def share_left_out(pushes: Sequence[Push], recording: Recording, system: System) -> float:
