@@ -346,6 +346,7 @@ def test_a_quantity_of_opposite_sign_is_inverted_and_the_cause_keeps_its_own(nam
     turned = tuple(Episode(e.time, command * e.action, e.state * np.array(states)) for e in forced.episodes)
     result = diagnose(dataclasses.replace(forced, episodes=turned), SOURCE, catalogue=[ConstantForce, AngleOffset])
     assert any(f"the {name} has the opposite sign" in warning for warning in result.warnings)
+    assert f"gap to the simulator. That holds with the {name} inverted: as it is, " in str(result)
     assert not any(A_ROW_LATE in warning for warning in result.warnings)
     assert names(result) == {"constant_force"}
     assert result.causes[0].parameters["force"].value == pytest.approx(1.0, rel=0.05)

@@ -29,6 +29,7 @@ from visadapt.diagnosis.words import (
     CHANGES_BETWEEN,
     MISFIT,
     ONE_BY_ONE,
+    OPPOSITE,
     chance,
     closed,
     estimate,
@@ -75,7 +76,17 @@ def effects(names: Sequence[str]) -> str:
 
 
 def sentence(diagnosis: Diagnosis) -> str:
-    """The verdict in one plain sentence, with physical units."""
+    """The verdict in one plain sentence, with physical units, and one on signs that were inverted."""
+    opposite = [warning.partition(OPPOSITE)[0] for warning in diagnosis.warnings if OPPOSITE in warning]
+    if not opposite:
+        return _sentence(diagnosis)
+    return (
+        f"{_sentence(diagnosis)} That holds with {listed(opposite)} inverted: as it is, with the opposite sign of the "
+        "simulator's, a policy would drive the machine the wrong way."
+    )
+
+
+def _sentence(diagnosis: Diagnosis) -> str:
     gap = diagnosis.gap
     if diagnosis.verdict == NO_GAP and not math.isnan(gap.closed):
         return (
