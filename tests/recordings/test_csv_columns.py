@@ -2,9 +2,14 @@ import os
 
 import numpy as np
 import pytest
+import torch
+from scipy.spatial.transform import Rotation
 
 from tests.logs import ROS, ros_bag
 from tests.recorded import HEADER, STATES, a_run, a_table, load, refuses, write
+from visadapt.recordings import RecordingError, load_recording
+from visadapt.systems import Quadrotor
+from visadapt.systems.rigid_body import rotation
 
 
 class TestColumns:
@@ -63,6 +68,19 @@ class TestColumns:
         table = a_table()
         del table[missing]
         refuses(f"run.csv: column '{missing}' is missing; it has .*--columns {missing}=", write(file, table))
+
+    def test_angles_of_an_attitude_are_to_be_made_a_quaternion(self, file):
+        header = ["time", "x", "y", "z", "roll", "pitch", "yaw", "thrust", "omega_x_cmd", "omega_y_cmd", "omega_z_cmd"]
+        path = write(file, {name: np.zeros(30) for name in header})
+        made = r"q_x, q_y, q_z, q_w = .*from_euler\('ZYX', \[yaw, pitch, roll\]\).as_quat\(\), with angles in rad"
+        for given in ({}, {"roll": "roll*pi/180"}):
+            with pytest.raises(RecordingError, match=made):
+                load_recording(path, Quadrotor(), given)
+        roll, pitch, yaw = 0.2, -0.3, 0.5
+        x, y, z, w = Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_quat()
+        ours = rotation(torch.tensor([[w, x, y, z]]))[0].numpy()
+        forward = [np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)]
+        np.testing.assert_allclose(ours[:, 0], forward, atol=1e-12)
 
     def test_states_that_were_not_measured(self, file):
         table = a_table()

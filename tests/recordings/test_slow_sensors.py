@@ -1,11 +1,15 @@
 """Sensors slower than the rows: what a table repeats, or leaves empty, between two readings is not used as one."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from tests.recorded import a_run, load, refuses, write
 from visadapt.diagnosis import diagnose
 from visadapt.effects import Dropout, FrozenZone, PositionDelay, ViscousFriction
+from visadapt.recordings.clock import RawEpisode
+from visadapt.recordings.slow_sensors import without_held_readings
 from visadapt.systems import CartPole
 from visadapt.world import World
 
@@ -78,6 +82,17 @@ def test_rows_that_are_lost_at_random_are_no_slow_sensor(file, run, share):
     fresh = np.random.default_rng(0).uniform(size=ROWS) > share
     lost = {name: held(run[name], fresh) for name in ("x", "theta")}
     assert not load(write(file, {**run, **lost}), columns=POSITIONS_ALONE).usable
+
+
+def test_a_few_readings_that_are_rounded_to_the_last_one_are_no_slow_sensor():
+    values = np.random.default_rng(0).standard_normal(1200).cumsum()
+    for row in (82, 766, 934, 1134):
+        values[row] = values[row - 1]
+    raw = RawEpisode(Path("run.csv"), 0.02 * np.arange(1200), np.zeros((1200, 1)), values[:, None], ("theta",))
+    said = []
+    (found,) = without_held_readings([raw], CartPole(), lambda text, where: said.append(text))
+    assert found.usable is None
+    assert said == []
 
 
 def test_a_position_that_grows_steadily_is_held_as_the_other_is(file, run):

@@ -26,6 +26,14 @@ OTHER_NAMES: dict[str, dict[str, tuple[str, ...]]] = {
 }
 """Other common names of a system's variables; upper and lower case are the same."""
 
+EULER = {"roll", "pitch", "yaw", "phi", "psi"}
+"""Names of an attitude's angles, in lower case, which are not read."""
+
+AS_QUATERNION = (
+    "; an attitude is read as a quaternion, from body to world: q_x, q_y, q_z, q_w = "
+    "scipy.spatial.transform.Rotation.from_euler('ZYX', [yaw, pitch, roll]).as_quat(), with angles in rad"
+)
+
 
 _NUMBER = r"\s*-?(?:pi|(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*"
 _FACTORS = rf"(?:[*/]{_NUMBER})*"
@@ -101,7 +109,8 @@ def check_given(given: Mapping[str, str], ours: Sequence[str], system: System) -
     states, optional = [state.name for state in system.states], may_be_unmeasured(system)
     for name, theirs in given.items():
         if name not in ours:
-            raise RecordingError(f"--columns {name}=...: {system.name} has no {name!r}; it has {', '.join(ours)}")
+            hint = AS_QUATERNION if isinstance(system, RigidBody) and name.lower() in EULER else ""
+            raise RecordingError(f"--columns {name}=...: {system.name} has no {name!r}; it has {', '.join(ours)}{hint}")
         if not theirs and name not in optional:
             raise RecordingError(f"--columns {name}=: {name} is needed; --columns {name}=... names it")
     if all(given.get(name) == "" for name in states):
@@ -149,7 +158,7 @@ def match(
             raise RecordingError(f"{path}: has no column {named!r} for {name}; it has {', '.join(header)}{hint}")
         elif name in needed(system):
             raise RecordingError(
-                f"{path}: column {name!r} is missing; it has {', '.join(header)}; "
+                f"{path}: column {name!r} is missing; it has {', '.join(header)}{_if_euler(name, header)}; "
                 f"if one of them is {name}: --columns {name}=...{if_unmeasured(system, name)}"
             )
     return found
@@ -177,6 +186,11 @@ def convert(
         name: read_column(given[name], header).converted(numbers) if name in given else numbers
         for name, numbers in values.items()
     }
+
+
+def _if_euler(name: str, header: Collection[str]) -> str:
+    """What to say where a part of a quaternion is missing and the file has the angles of an attitude."""
+    return AS_QUATERNION if name.startswith("q_") and EULER & {column.lower() for column in header} else ""
 
 
 def if_unmeasured(system: System, name: str) -> str:
