@@ -13,8 +13,9 @@ import torch
 from visadapt import diagnose
 from visadapt.cli.main import main
 from visadapt.diagnosis.search.preparation import prepare
+from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.search.searched_effects import searched
-from visadapt.effects import ActuatorDelay, ConstantForce, LiftSlope, LinearDrag, ThrustGain, Wind
+from visadapt.effects import ActuatorDelay, ConstantForce, LiftSlope, LinearDrag, PositioningDelay, ThrustGain, Wind
 from visadapt.effects.catalogue import catalogue
 from visadapt.estimation.profiles import PROFILES
 from visadapt.recordings import Episode, Recording
@@ -216,3 +217,17 @@ def test_a_quaternion_s_sign_does_not_matter():
 def test_terms_of_theorem_1_need_a_system_with_one_action():
     with pytest.raises(ValueError, match="one action"):
         diagnose(record(Quadrotor(), episodes=1), World(Quadrotor(), period=0.1), policy=lambda state: state[:, :4])
+
+
+def test_a_satellite_receiver_is_late_by_what_it_is_at_any_speed():
+    """Positions and velocities with its noise, 0.2 s late at 11 m/s: 2 m behind from the first row on."""
+    whole, late = record(FixedWing(), episodes=3, rows=64), 4
+    generator = np.random.default_rng(0)
+    episodes = []
+    for episode in whole.episodes:
+        state = episode.state[late:].copy()
+        state[:, :6] = episode.state[:-late, :6] + 0.3 * generator.standard_normal((len(state), 6))
+        episodes.append(Episode(episode.time[late:] - episode.time[late], episode.action[late:], state))
+    rows = prepare(dataclasses.replace(whole, episodes=tuple(episodes)), FixedWing()).rows
+    found = Search(FixedWing(), rows, [PositioningDelay]).single(PositioningDelay)
+    assert found.fits.theta.item() == pytest.approx(0.2, abs=0.01)

@@ -201,8 +201,8 @@ def test_the_slower_topic_is_not_the_one_that_ends_first_and_what_is_cut_off_is_
     found = load_recording(numbers(tmp_path / "run", stamps), CartPole(), FIELDS)
     assert found.period == pytest.approx(0.02)
     said = " ".join(found.warnings)
-    assert "25 rows before the first message of /u are left out" in said
-    assert "425 rows after the last message of /theta are left out" in said
+    assert "rows before the first message of /u are left out: 25" in said
+    assert "rows after the last message of /theta are left out: 425" in said
 
 
 @pytest.mark.parametrize(

@@ -207,9 +207,9 @@ class _Log:
         if len(rows) < 2:
             raise RecordingError(f"{self.path}: {', '.join(topics)} have no time in common")
         if early.any():
-            note(f"{early.sum()} rows before the first message of {last_to_begin} are left out", str(self.path))
+            note(f"rows before the first message of {last_to_begin} are left out: {early.sum()}", str(self.path))
         if late.any():
-            note(f"{late.sum()} rows after the last message of {first_to_end} are left out", str(self.path))
+            note(f"rows after the last message of {first_to_end} are left out: {late.sum()}", str(self.path))
         return self._with_slower(rows)
 
     def _with_slower(self, rows: NDArray[np.intp]) -> _Rows:
