@@ -58,6 +58,10 @@ POLISH_MODELS = 8
 """Log posterior odds behind the best set up to which sets are fitted carefully, POLISH_MODELS at most. Sets with fewer
 parameters than the best may be farther behind, since a quick fit of the right set may keep too much process noise."""
 
+SETTLED_STEP, LAST_STEP = MAX_EFFECTS + 3, 2 * MAX_EFFECTS
+"""Steps of progress after which the sets near the best are fitted, and after which all else is: where much stays
+unexplained, either takes as long as three additions of an effect."""
+
 Exchanges = set[frozenset[str]]
 """Sets, by the names of their effects, that were kept so far when others were exchanged."""
 
@@ -69,7 +73,7 @@ class Search(FittedModels):
         """Grow sets while that raises the posterior odds, then try sets near the best."""
         beam, exchanged = [self.source], Exchanges()
         for size in range(MAX_EFFECTS):
-            self._report(progress, size)
+            self._report(progress, size, LAST_STEP)
             before = self.best
             children = self.extend(beam) if size else self.fit_singles()
             if not children:
@@ -78,12 +82,14 @@ class Search(FittedModels):
             if ranked[0].log_odds < before.log_odds:
                 break
             beam = self._worth_extending(ranked)
+        self._report(progress, MAX_EFFECTS, LAST_STEP)
         self._settle(exchanged)
         if not self.explains_all(self.best):
+            self._report(progress, SETTLED_STEP, LAST_STEP)
             self._grow_late(self.try_late_sensors())
             self._settle(exchanged)
             self._phases_of_episodes()
-        self._report(progress, MAX_EFFECTS)
+        self._report(progress, LAST_STEP, LAST_STEP)
 
     def fit_singles(self) -> list[ScoredModel]:
         """The fitted sets of one effect. If there are none yet, fit them: every effect, if effects are so large that
@@ -136,10 +142,10 @@ class Search(FittedModels):
             self._settle(Exchanges())
         return True
 
-    def _report(self, progress: Progress | None, step: int) -> None:
-        """Report a step of MAX_EFFECTS, with the loss of the best set so far."""
+    def _report(self, progress: Progress | None, step: int, last: int = MAX_EFFECTS) -> None:
+        """Report a step, of which there are `last`, with the loss of the best set so far."""
         if progress is not None:
-            progress(step, MAX_EFFECTS, -self.best.log_odds)
+            progress(step, last, -self.best.log_odds)
 
     def promised(self) -> float:
         """Log likelihood that the best effect adds to the source, by the screening."""
