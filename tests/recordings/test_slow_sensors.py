@@ -88,7 +88,7 @@ def test_a_few_readings_that_are_rounded_to_the_last_one_are_no_slow_sensor():
     values = np.random.default_rng(0).standard_normal(1200).cumsum()
     for row in (82, 766, 934, 1134):
         values[row] = values[row - 1]
-    raw = RawEpisode(Path("run.csv"), 0.02 * np.arange(1200), np.zeros((1200, 1)), values[:, None], ("theta",))
+    raw = RawEpisode(Path("run.csv"), np.linspace(0.0, 23.98, 1200), np.zeros((1200, 1)), values[:, None], ("theta",))
     said = []
     (found,) = without_held_readings([raw], CartPole(), lambda text, where: said.append(text))
     assert found.usable is None
