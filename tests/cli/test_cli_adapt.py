@@ -84,7 +84,7 @@ def test_the_causes_of_the_gap_are_named_and_put_into_the_simulator(here, capsys
     policy = ("--policy", SHIPPED, "--target", "rig:states", "--diagnose")
     assert run("adapt", *policy, *SMALL) == 0
     # A bias of the command is the same as the target's force of 1 N.
-    said = "ambiguous: actuator_bias (offset 0.0333); as well explained by constant_force (force 1.000 N), for which"
+    said = "ambiguous: actuator_bias (offset 0.0333); as well explained by constant_force (force 1.000 N) (to tune"
     assert said in capsys.readouterr().out
     (bias,) = va.load_source("run/policy.safetensors").effects
     assert bias.name == "actuator_bias"

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from visadapt.diagnosis.exploration import Explored, explore
 from visadapt.diagnosis.measured_gap import MeasuredGap, measure
 from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, UNEXPLAINED, Cause, Push, without_slight
+from visadapt.diagnosis.search.apart import ExplainedAlone
 from visadapt.diagnosis.search.causes import causes
 from visadapt.diagnosis.search.fitted_models import ScoredModel
 from visadapt.diagnosis.search.passing_loads import passing_loads
@@ -60,7 +61,8 @@ def answer(
     """What explains a recording, if need be beside pushes.
 
     A push acts in one episode alone, as no effect does: while it is among the rows, the most probable set is one that
-    imitates it. So where a recording is unexplained, the rows within pushes are left out, and the others are explained.
+    imitates it. So where a recording is unexplained, the rows within pushes are left out, and the others are explained,
+    unless all is explained in each of several recordings by itself: then it is the machine that was changed.
     If these have no gap, the recording stays unexplained, with what passes in `pushes`.
 
     Args:
@@ -78,7 +80,7 @@ def answer(
     finder = _PushFinder(world, explored)
     first = latest = _answer(explored, finder, (), jobs, progress)
     for _ in range(ROUNDS):
-        if latest.verdict != UNEXPLAINED:
+        if latest.verdict != UNEXPLAINED or _without_pushes(latest.explored.apart):
             break
         found = _hiding(latest, finder)
         aside = (*latest.set_aside, *found)
@@ -133,6 +135,11 @@ def _hiding(unexplained: Answer, finder: _PushFinder) -> tuple[Push, ...]:
             whole = finder.pushes_beyond(explored, search.source)
             return (*further, *(one for one in whole if any(one.overlaps(other) for other in further)))
     return ()
+
+
+def _without_pushes(apart: Sequence[ExplainedAlone]) -> bool:
+    """Whether recordings are explained one by one, by effects none of which may stand for a push."""
+    return bool(apart) and not any(_is_in_time(effect) for each in apart for effect in each.best.effects)
 
 
 def _is_in_time(effect: type[Effect]) -> bool:

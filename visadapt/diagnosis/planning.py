@@ -233,8 +233,7 @@ class _Trials:
                     for truth, other in ((0, rival), (rival, 0))
                 )
             if progress is not None:
-                best, apart = _best(worth)
-                progress(done + 1, len(self.names), float(worth[best, apart].min()))
+                progress(done + 1, len(self.names), math.nan)
         return worth
 
 
