@@ -33,6 +33,7 @@ def test_what_explains_each_is_said():
     offset = friday.partition("angle offset (offset ")[2].split()[0]
     assert float(offset) == pytest.approx(0.03, rel=0.1)
     assert str(found).startswith("unexplained: Each recording is explained by itself, but not all together")
+    assert found.where.pushes == ()
 
 
 def test_the_unchanged_simulator_may_explain_one_of_them():

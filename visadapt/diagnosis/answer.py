@@ -109,7 +109,7 @@ def _answer(
     source_leaves = [] if found else left_by_source(search)
     # Where the causes explain the recording, the pushes are those beyond them.
     beyond = (comparison.best, comparison.functions) if found else (search.source, source_leaves)
-    passing = finder.pushes_beyond(explored, *beyond)
+    passing = () if _without_pushes(explored.apart) else finder.pushes_beyond(explored, *beyond)
     if found and not aside and not comparison.unexplained(measured.improvable):
         model = CandidateModel(search.system, comparison.best.effects, search.rows)
         passing = depart_from(model, comparison.predicting, passing)
