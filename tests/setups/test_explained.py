@@ -8,6 +8,7 @@ import visadapt as va
 from tests.own_systems import Pendulum
 from visadapt.diagnosis import excitations, planning
 from visadapt.diagnosis.result import SCHEMA_VERSION
+from visadapt.diagnosis.verdict import CLOSES_BUT
 from visadapt.effects import EFFECTS
 from visadapt.recordings import read_recording
 from visadapt.setups.explained import doubts, explained
@@ -121,6 +122,22 @@ def test_nothing_is_doubted_of_a_target_that_shows_what_the_source_has(tmp_path)
         episodes = [run.episode for run in runs]
         va.write_recording(tmp_path / f"{rows}.h5", episodes)
         assert doubts([tmp_path / f"{rows}.h5"], episodes, source) == []
+
+
+def test_what_named_causes_leave_is_left_to_a_residual(tmp_path, only_effects):
+    only_effects("viscous_friction")
+    policy, path = va.load_policy(va.shipped("cartpole_states")), tmp_path / "found.json"
+    target = va.SyntheticTarget(lambda batch, generator: [va.effects.ViscousFriction(coefficient=5.0)])
+    runs = va.run(target, policy, 1, 60, torch.Generator().manual_seed(0), exploration=0.3)
+    va.write_recording(tmp_path / "run.h5", [runs[0].episode])
+    explain = explained(va.World(va.CartPole()))
+    found = explain([tmp_path / "run.h5"], path)
+    assert (found.verdict, found.complete) == ("identified", True)
+    content = read_json(path)
+    write_json(path, content | {"warnings": [f"{CLOSES_BUT}: an unexplained load depends on x"]})
+    left = explain([tmp_path / "run.h5"], path)
+    assert (left.verdict, left.complete) == ("identified", False)
+    assert [effect.name for effect in left.effects] == ["viscous_friction"]
 
 
 class Creep(va.DynamicsEffect):

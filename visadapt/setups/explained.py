@@ -50,8 +50,8 @@ def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, r
     They are read and checked, and each diagnosis is written, as by `visadapt diagnose --json`. Where most samples
     are in episodes shorter than a prediction, there is no diagnosis. Where the recordings cannot tell causes apart,
     the likeliest is taken, by preference one in which no sensor is wrong, and, unless they are frames, an
-    experiment is designed for the next round. Where the gap stays unexplained, a residual is to learn it, beside
-    the nearest effects where these close nearly all of it.
+    experiment is designed for the next round. Where causes leave something unexplained, a residual is to learn it;
+    where the gap stays unexplained, all of it, beside the nearest effects where these close nearly all of it.
 
     Raises:
         ValueError: the source has effects, which a diagnosis would have to know.
