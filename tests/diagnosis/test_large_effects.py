@@ -76,6 +76,7 @@ def test_what_nearly_describes_a_large_effect_is_named_with_a_warning_whatever_t
     recording = record([CreepingFriction()], episodes=4, rows=150, measured=states, noise=(noise,) * 4)
     found = va.diagnose(recording, va.World(CartPole()))
     assert found.verdict == "identified"
+    assert (found.gap.after > 3 * found.gap.floor) == (noise == 1e-3)
     (friction,) = (cause for cause in found.causes if not cause.slight)
     assert friction.effect == "coulomb_friction"
     assert friction.parameters["force"].value == pytest.approx(3.0, rel=0.05)

@@ -363,5 +363,8 @@ def test_a_push_is_none_where_every_row_is_as_predicted():
     for recording, kept in ((quiet, ()), (dataclasses.replace(quiet, episodes=tuple(episodes)), (push,))):
         rows = prepare(recording, CartPole()).rows
         fits = Search(CartPole(), rows, []).source.fits
-        assert depart_from(CandidateModel(CartPole(), [], rows), fits, [push]) == kept
-        assert depart_from(CandidateModel(CartPole(), [], rows), fits, [dataclasses.replace(push, episode=0)]) == ()
+        model = CandidateModel(CartPole(), [], rows)
+        assert depart_from(model, fits, [push]) == kept
+        assert depart_from(model, fits, [dataclasses.replace(push, episode=0)]) == ()
+        unread = dataclasses.replace(push, start=8.0, end=9.0)
+        assert depart_from(model, fits, [unread]) == (unread,), "of rows that are not read, nothing is known"

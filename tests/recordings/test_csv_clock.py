@@ -114,7 +114,7 @@ class TestEpisodes:
         recording = load(tmp_path)
         assert len(recording.episodes) == 1
         assert recording.warnings == (
-            f"{tmp_path / 'b.csv'}, from row 1 (line 2) on: too short for a prediction of 0.5 s, so it is left out",
+            f"{tmp_path / 'b.csv'}, from row 1 (line 2) on: shorter than 0.5 s, so it is left out",
         )
 
     def test_half_a_second_is_enough(self, file):

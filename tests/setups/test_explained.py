@@ -115,6 +115,15 @@ def test_readings_in_another_unit_are_to_be_mended_in_the_target(tmp_path, rows,
     assert doubts([tmp_path / "run.h5"], episodes, source) == [str(refused.value)]
 
 
+def test_a_velocity_of_a_dead_sensor_is_doubted(tmp_path):
+    policy, source = va.load_policy(va.shipped("cartpole_states")), va.World(va.CartPole())
+    (found,) = va.run(va.SyntheticTarget(), policy, 1, 150, torch.Generator().manual_seed(0), exploration=0.3)
+    dead = replace(found.episode, state=found.episode.state * np.array([1, 0, 1, 1]))
+    va.write_recording(tmp_path / "run.h5", [dead], [state.name for state in va.CartPole.states], ["command"])
+    (doubt,) = doubts([tmp_path / "run.h5"], [dead], source)
+    assert doubt.endswith("x_dot never changes although its position does: a dead sensor; it was left out")
+
+
 def test_nothing_is_doubted_of_a_target_that_shows_what_the_source_has(tmp_path):
     policy, source = va.load_policy(va.shipped("cartpole_states")), va.World(va.CartPole())
     for rows in (8, 150):

@@ -68,9 +68,6 @@ def run(options: argparse.Namespace) -> None:
         print(_in_words(last))
         for warning in last.warnings:
             print(f"Warning    {warning}")
-    elif policy.shown == "state":
-        for doubt in doubts(sorted(folder.glob("round-*/recording.h5")), adapted.episodes, source):
-            print(f"Warning    {doubt}")
     if adapted.taken_back:
         tuned = copy.deepcopy(adapted.policy)
         adapted.restore(tuned, adapted.rounds[-1].samples)
@@ -81,6 +78,9 @@ def run(options: argparse.Namespace) -> None:
             f"{adapted.taken_back}{hint}"
         )
     print(f"{adapted.ledger.used} samples of {target.name} used; the policy is {folder / 'policy.safetensors'}")
+    if not options.diagnose and policy.shown == "state":
+        for doubt in doubts(sorted(folder.glob("round-*/recording.h5")), adapted.episodes, source):
+            print(f"Warning    {doubt}")
 
 
 def _in_words(explanation: Explanation) -> str:

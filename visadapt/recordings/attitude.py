@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 
 from visadapt.recordings.clock import RawEpisode
-from visadapt.recordings.episode import RecordingError
+from visadapt.recordings.episode import MisreadError
 from visadapt.recordings.physics import DEGREE, correlation
 from visadapt.systems import System
 from visadapt.systems.rigid_body import ATTITUDE, RATES, RigidBody, continuous_quaternion, quaternion_rate
@@ -23,7 +23,7 @@ def check_attitude(raw: RawEpisode, system: System) -> None:
     """Check the quaternion and the body rates of an episode of a vehicle.
 
     Raises:
-        RecordingError: the quaternion has not the length 1, its numbers are in another order, it rotates the world into
+        MisreadError: the quaternion has not the length 1, its numbers are in another order, it rotates the world into
             the body, or the rates are in deg/s.
     """
     if not isinstance(system, RigidBody):
@@ -33,20 +33,20 @@ def check_attitude(raw: RawEpisode, system: System) -> None:
     row = int(np.abs(length - 1).argmax())
     first = system.states[ATTITUDE][0].name
     if abs(length[row] - 1) > MOST_OFF_UNIT:
-        raise RecordingError(
+        raise MisreadError(
             f"{raw.cell(row, first)}: the quaternion's length is {length[row]:.3g}; a unit quaternion is right"
         )
     fit, slope = _turning(raw, attitude, rates)
     if fit > TURNS_CORRELATION and 0.5 < slope * DEGREE < 2:
         right = "rad/s are right (these look like degrees per second)"
-        raise RecordingError(f"{raw.origin}: the body rates are {slope:.0f} times what the attitude says; {right}")
+        raise MisreadError(f"{raw.origin}: the body rates are {slope:.0f} times what the attitude says; {right}")
     if fit < -TURNS_CORRELATION:
-        raise RecordingError(
+        raise MisreadError(
             f"{raw.origin}: the attitude turns against the body rates; a quaternion that rotates body into world axes "
             "is right"
         )
     if fit < OTHER_CORRELATION and _turning(raw, np.roll(attitude, 1, axis=1), rates)[0] > TURNS_CORRELATION:
-        raise RecordingError(
+        raise MisreadError(
             f"{raw.origin}: the attitude's numbers are in the order x, y, z, w; {first}, the scalar, first is right"
         )
 

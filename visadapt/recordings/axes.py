@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 
 from visadapt.recordings.clock import RawEpisode
-from visadapt.recordings.episode import RecordingError
+from visadapt.recordings.episode import MisreadError
 from visadapt.recordings.physics import EXPLAINED_ERROR, TURNS, Columns, agreements, can_decide
 from visadapt.systems import RigidBody, System
 
@@ -31,7 +31,7 @@ of the recording, where the others explain them."""
 
 
 def check_axes(episodes: Sequence[RawEpisode], system: System) -> None:
-    """Raises RecordingError where the source explains a vehicle's motion far better in other axes, or with other signs
+    """Raises MisreadError where the source explains a vehicle's motion far better in other axes, or with other signs
     of its commands."""
     if not isinstance(system, RigidBody) or not can_decide(episodes, system, "xyz"):
         return
@@ -48,11 +48,11 @@ def check_axes(episodes: Sequence[RawEpisode], system: System) -> None:
             wrong = f"its axes pointed {axes}"
             states = [name for name in TURNED[axes] if name in episodes[0].measured]
             right = f"{', '.join((*states, *_opposite_commands(episodes, system, TURNED[axes])))} with the other sign"
-        raise RecordingError(
+        raise MisreadError(
             f"{origin}: it moves as if {wrong}; forward, left and up are right: {right} (--columns NAME=COLUMN*-1,...)"
         )
     if opposite := _opposite_commands(episodes, system):
-        raise RecordingError(
+        raise MisreadError(
             f"{origin}: it turns as if {' and '.join(opposite)} had the other sign "
             f"(--columns {','.join(f'{name}=COLUMN*-1' for name in opposite)})"
         )

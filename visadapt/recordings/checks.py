@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from visadapt.recordings.attitude import check_attitude
 from visadapt.recordings.axes import check_axes
 from visadapt.recordings.clock import GAP_PERIODS, UNITS_S, Note, RawEpisode
-from visadapt.recordings.episode import RecordingError
+from visadapt.recordings.episode import MisreadError, RecordingError
 from visadapt.recordings.physics import (
     DEGREE,
     are_degrees,
@@ -44,7 +44,7 @@ IS_RATE_CORRELATION, NOT_RATE_CORRELATION = 0.8, 0.3
 
 
 def check_finite(raw: RawEpisode, actions: Sequence[Variable]) -> None:
-    """Raises RecordingError that names the first cell that is not finite."""
+    """Raises MisreadError that names the first cell that is not finite."""
     table = np.column_stack([raw.time, raw.state, raw.action])
     bad = ~np.isfinite(table)
     if bad.any():
@@ -60,7 +60,7 @@ def check_commands(episodes: Sequence[RawEpisode], system: System, note: Note) -
     """Check that commands lie in the system's range; notes those outside, and commands that never change.
 
     Raises:
-        RecordingError: most commands lie outside, or one is more than twice as large as the range allows.
+        MisreadError: most commands lie outside, or one is more than twice as large as the range allows.
     """
     for column, variable in enumerate(system.actions):
         every = np.concatenate([raw.action[:, column] for raw in episodes])
@@ -91,7 +91,7 @@ def check_commands(episodes: Sequence[RawEpisode], system: System, note: Note) -
         if share > 0.5 or abs(farthest) > 2 * scale:
             unit = "" if variable.unit == "1" else f" ({variable.unit})"
             hint = " (name a column in N 'force')" if not unit and hasattr(system, "max_force") else unit
-            raise RecordingError(
+            raise MisreadError(
                 f"{raw.cell(row, variable.name)} is {farthest:g}, and {share:.0%} of the column lie outside; "
                 f"{right}{hint}"
             )
@@ -102,7 +102,7 @@ def check_units(episodes: Sequence[RawEpisode], system: System) -> None:
     """Check the columns of a file's episodes, all of which have the same.
 
     Raises:
-        RecordingError: angles are evidently in degrees or measured from another zero, lengths in cm or mm, signs
+        MisreadError: angles are evidently in degrees or measured from another zero, lengths in cm or mm, signs
             wrong, or columns exchanged.
     """
     variables = {variable.name: variable for variable in system.states}
@@ -125,50 +125,50 @@ def check_units(episodes: Sequence[RawEpisode], system: System) -> None:
 
 
 def _check_jumps(raw: RawEpisode, angles: Sequence[str]) -> None:
-    """Raises RecordingError where an angle jumps by more than a turn from row to row."""
+    """Raises MisreadError where an angle jumps by more than a turn from row to row."""
     for name in angles:
         steps = np.abs(np.diff(raw.states[name]))
         lasting = np.diff(raw.time)
         steps[lasting > GAP_PERIODS * np.median(lasting)] = 0.0  # a joint turns on while rows are missing
         row = int(steps.argmax()) + 1
         if steps.max() > 1.25 * TURN:
-            raise RecordingError(
+            raise MisreadError(
                 f"{raw.cell(row, name)} jumps from {raw.states[name][row - 1]:g} to {raw.states[name][row]:g}; "
                 f"radians are right (these look like degrees){raw.conversion(name, '*pi/180')}"
             )
 
 
 def _check_answers(judged: Sequence[RawEpisode], system: System, angles: Sequence[str], lengths: Sequence[str]) -> None:
-    """Raises RecordingError where states answer the commands as the source says only with another sign, zero, unit, or
+    """Raises MisreadError where states answer the commands as the source says only with another sign, zero, unit, or
     as each other; `angles` and `lengths` name the states in rad and in m."""
     whole = judged[0]
     check_axes(judged, system)
     if isinstance(system, RigidBody) and is_turned_round(judged, system, "z"):
-        raise RecordingError(
+        raise MisreadError(
             f"{whole.origin}: {whole.column('z')} accelerates against the thrust, as if it pointed down; up is right"
         )
     if is_half_a_turn_off(judged, system):
         zero = "0 upright" if isinstance(system, CartPole) else "the source's zero"
-        raise RecordingError(
+        raise MisreadError(
             f"{whole.origin}: {whole.column(angles[0])} answers the command as it should half a turn further; "
             f"{zero} is right{whole.conversion(angles[0], '-pi')}"
         )
     if are_degrees(judged, system):
         name, values = angles[0], np.concatenate([raw.states[angles[0]] for raw in judged])
-        raise RecordingError(
+        raise MisreadError(
             f"{whole.origin}: {whole.column(name)} goes from {values.min():.3g} to {values.max():.3g} and answers the "
             f"command as if in degrees; radians are right{whole.conversion(name, '*pi/180')}"
         )
     for name, other in product(lengths, angles):
         if exchanged(judged, system, name, other):
-            raise RecordingError(
+            raise MisreadError(
                 f"{whole.origin}: {whole.column(name)} answers the command as {other} should, and "
                 f"{whole.column(other)} as {name}: they are exchanged "
                 "(or the command's sign is wrong: positive pushes towards +x)"
             )
     if not isinstance(system, RigidBody) and (commands := exchanged_commands(judged, system)):
         one, other = commands
-        raise RecordingError(
+        raise MisreadError(
             f"{whole.origin}: {whole.column(one)} moves what {other} should, and {whole.column(other)} what {one} "
             f"should: they are exchanged{whole.exchange(one, other)}"
         )
@@ -180,7 +180,7 @@ def _rates(time: NDArray[np.float64], values: NDArray[np.float64], angle: bool) 
 
 
 def _check_clock(raw: RawEpisode, system: System) -> None:
-    """Raises RecordingError where all positions change faster than their rates say, by the factor of a unit of time."""
+    """Raises MisreadError where all positions change faster than their rates say, by the factor of a unit of time."""
     ratios = {}
     for name, values in raw.states.items():
         rate = raw.states.get(system.rate_of(name) or "")
@@ -190,14 +190,14 @@ def _check_clock(raw: RawEpisode, system: System) -> None:
     units = {system.states[system.index(name)].unit for name in ratios}
     in_degrees = [abs(math.log(max(ratio, 1e-9) * DEGREE)) < SURE_OF_DEGREES for ratio in ratios.values()]
     if len(ratios) > 1 and units == {"rad"} and all(in_degrees):
-        raise RecordingError(
+        raise MisreadError(
             f"{raw.origin}: columns {', '.join(ratios)} change {1 / DEGREE:.1f} times as fast as their rates say: they "
             f"are in degrees; radians are right{raw.conversion(next(iter(ratios)), '*pi/180')}"
         )
     for unit, seconds in UNITS_S.items():
         # With one ratio alone, the position may be in another unit instead.
         if len(ratios) > 1 and all(0.8 < ratio / seconds < 1.25 for ratio in ratios.values()):
-            raise RecordingError(
+            raise MisreadError(
                 f"{raw.origin}: column 'time': by it {', '.join(ratios)} change {seconds:g} times as fast as their "
                 f"rates say: the clock is in {unit}; seconds are right{raw.conversion('time', f'*{seconds:g}')}"
             )
@@ -218,7 +218,7 @@ def _check_rate(raw: RawEpisode, variable: Variable, rate: Variable, stride: int
     beyond = angle and float(np.abs(values).max()) > TURN
     if fast > (rate.largest if beyond else limit):
         row = int(np.abs(values).argmax())
-        raise RecordingError(
+        raise MisreadError(
             f"{raw.cell(row, variable.name)} is {values[row]:g} {variable.unit}, and it changes by up to "
             f"{np.abs(coarse).max():.3g} {rate.unit}; {right}{raw.conversion(variable.name, to_ours)}; or is the clock "
             f"not in seconds, or the range of {rate.name} ({rate.low:g} to {rate.high:g}) too narrow?"
@@ -227,12 +227,12 @@ def _check_rate(raw: RawEpisode, variable: Variable, rate: Variable, stride: int
         return
     if float(np.quantile(np.abs(measured), 0.9)) > limit:
         row = int(np.abs(measured).argmax())
-        raise RecordingError(
+        raise MisreadError(
             f"{raw.cell(row, rate.name)} is {measured[row]:g} {rate.unit}; {right}{raw.conversion(rate.name, to_ours)}"
         )
     between = 0.5 * (measured[1:] + measured[:-1])
     if _is_opposite(change, between):
-        raise RecordingError(
+        raise MisreadError(
             f"{raw.origin}: {raw.column(rate.name)} has the opposite sign of the change of {variable.name}"
             f"{raw.conversion(rate.name, '*-1')}"
         )
@@ -242,7 +242,7 @@ def _check_rate(raw: RawEpisode, variable: Variable, rate: Variable, stride: int
     for times, exact in ((1 / DEGREE, to_ours),) if angle else ((100.0, "/100"), (1000.0, "/1000")):
         for wrong, (large, small) in ((variable, sizes), (rate, sizes[::-1])):
             if 0.5 * times * small < large < 2 * times * small:
-                raise RecordingError(
+                raise MisreadError(
                     f"{raw.origin}: {raw.column(wrong.name)} is {times:.0f} times what the other says "
                     f"({variable.name} changes by {change.std():.3g} {rate.unit}, {rate.name} is {between.std():.3g} "
                     f"{rate.unit}, root mean square); {right}{raw.conversion(wrong.name, exact)}"
@@ -257,7 +257,7 @@ def _is_opposite(change: NDArray[np.float64], rate: NDArray[np.float64]) -> bool
 def _check_exchanged(
     episodes: Sequence[RawEpisode], variables: Mapping[str, Variable], rates: Mapping[str, str]
 ) -> None:
-    """Raises RecordingError where two columns are evidently exchanged; `rates` are the rates of those that have one."""
+    """Raises MisreadError where two columns are evidently exchanged; `rates` are the rates of those that have one."""
     raw = episodes[0]
 
     def changes(name: str, angle: bool) -> NDArray[np.float64]:
@@ -272,7 +272,7 @@ def _check_exchanged(
         crossed = correlation(changes(rates[name], False), later(name))
         own = correlation(change[name], rate)
         if crossed > IS_RATE_CORRELATION and own < NOT_RATE_CORRELATION and not _is_opposite(change[name], rate):
-            raise RecordingError(
+            raise MisreadError(
                 f"{raw.origin}: {raw.column(name)} and {raw.column(rates[name])} are evidently exchanged: "
                 "the first is the second's rate of change"
             )
@@ -280,7 +280,7 @@ def _check_exchanged(
         crossed = min(correlation(change[name], measured[other]), correlation(change[other], measured[name]))
         own = max(correlation(change[one], measured[one]) for one in (name, other))
         if crossed > IS_RATE_CORRELATION and own < NOT_RATE_CORRELATION:
-            raise RecordingError(
+            raise MisreadError(
                 f"{raw.origin}: {raw.column(name)} and {raw.column(other)} are evidently exchanged: "
                 f"{name} changes as {rates[other]} says, and {other} as {rates[name]} says"
             )
@@ -290,7 +290,7 @@ def _check_exchanged(
         row = int(steps.argmax())
         wraps = abs(steps[row] - TURN) < 0.5 and np.abs(values).max() < 0.55 * TURN
         if variables[name].unit == "m" and wraps:
-            raise RecordingError(
+            raise MisreadError(
                 f"{raw.cell(row + 1, name)} jumps by {steps[row]:.3g} m, like an angle that wraps; metres are right "
                 "(are two columns exchanged?)"
             )

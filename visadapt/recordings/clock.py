@@ -19,7 +19,8 @@ Note = Callable[[str, str], None]
 """Called with (what was changed or left out, where in the recording)."""
 
 CONVERSION = re.compile(r"; --columns [^;]+? converts| \(--columns [^)]+\)")
-"""How a message says that a file's column is converted: `RawEpisode.conversion`, and the check of a vehicle's axes."""
+"""How a message says that a file's columns are converted: `RawEpisode.conversion`, `RawEpisode.exchange`, and the check
+of a vehicle's axes."""
 GAP_PERIODS = 1.5
 """Step, in periods, above which rows are missing."""
 LATER_PERIODS = 0.5

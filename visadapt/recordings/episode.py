@@ -16,6 +16,10 @@ class RecordingError(ValueError):
     """A recording that cannot be used; the message is one line: which file and episode, and what would be right."""
 
 
+class MisreadError(RecordingError):
+    """A recording whose numbers are in another unit, sign, zero or order than their names say."""
+
+
 @dataclass(frozen=True)
 class Episode:
     """One uninterrupted run of T rows with states, frames, or both.

@@ -45,8 +45,6 @@ TABLES = (".txt", ".tsv", ".dat")
 """Suffixes of files in a folder that may be tables, and are not read with the folder."""
 VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".webm")
 """Suffixes of videos, which are told what they lack."""
-TOO_SHORT = "too short"
-"""What is said of an episode that is shorter than a prediction."""
 UPRIGHT_RAD = 1.0
 """rad from 0 up to which an angle counts as upright when it is unwrapped."""
 
@@ -304,13 +302,10 @@ def _long_enough(parts: Sequence[RawEpisode], shortest: float, note: Note) -> li
     longest = parts[int(np.argmax(durations))]
     if max(durations) < least:
         raise RecordingError(
-            f"{longest.origin}: {TOO_SHORT}: {len(longest.time)} rows, {max(durations):.4g} s; an uninterrupted run of "
+            f"{longest.origin}: too short: {len(longest.time)} rows, {max(durations):.4g} s; an uninterrupted run of "
             f"at least {shortest:g} s, with a clock in seconds, is right: so far predictions reach"
         )
     for part, duration in zip(parts, durations, strict=True):
         if duration < least:
-            note(
-                f"{TOO_SHORT} for a prediction of {shortest:g} s, so it is left out",
-                f"{part.origin}, from {part.place(0)} on",
-            )
+            note(f"shorter than {shortest:g} s, so it is left out", f"{part.origin}, from {part.place(0)} on")
     return [part for part, duration in zip(parts, durations, strict=True) if duration >= least]

@@ -8,9 +8,10 @@ differences of positions or differences of measured rates, are compared with the
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import combinations
+from functools import partial
+from itertools import combinations, product
 from typing import NamedTuple
 
 import numpy as np
@@ -34,6 +35,9 @@ EXPLAINED_ERROR, OTHERS_ERROR_RATIO = 0.75, 1.5
 another zero or sign explains these; and how many times as large the error of the angle as it is must be."""
 EXPLAINED_CORRELATION = 0.5
 """Correlation of measured and predicted accelerations above which the source explains them."""
+
+WEAKER, MOST_SIGNS = (0.3, 0.5, 0.7, 0.85), 5
+"""Factors of one command that are tried before two are called exchanged, and how many may have the other sign."""
 
 TURNS = ("omega_x", "omega_y", "omega_z")
 """Rates of turn of a vehicle, which are no variable's rate, and whose changes are judged as accelerations are; so are a
@@ -103,7 +107,7 @@ def is_half_a_turn_off(episodes: Sequence[RawEpisode], system: System) -> bool:
         return {name: values + math.pi if name == angle else values for name, values in columns.items()}
 
     def negated(columns: Columns) -> Columns:
-        return {name: -values if name in (angle, rate) else values for name, values in columns.items()}
+        return _negated(columns, (angle, rate or angle))
 
     def error(changed: Callable[[Columns], Columns]) -> float:
         return agreements(episodes, system, changed)[angle].error
@@ -164,33 +168,53 @@ def exchanged(episodes: Sequence[RawEpisode], system: System, one: str, other: s
 
 def exchanged_commands(episodes: Sequence[RawEpisode], system: System) -> tuple[str, str] | None:
     """Two commands of one unit with which the source explains every acceleration if they are exchanged, and not as they
-    are, late, or with other signs; None where there are none, or where that cannot be decided."""
+    are, late, weaker or with other signs, nor with a joint's sign turned, as where exchanged wheels turn a robot the
+    other way; None where there are none, or where that cannot be decided."""
     names = [variable.name for variable in system.states if system.rate_of(variable.name)]
-    actions = list(enumerate(system.actions))
-    pairs = [(i, k) for (i, one), (k, other) in combinations(actions, 2) if one.unit == other.unit]
+    count = len(system.actions)
+    pairs = [(i, k) for i, k in combinations(range(count), 2) if system.actions[i].unit == system.actions[k].unit]
     if not pairs or not can_decide(episodes, system, names):
         return None
-    identity = np.eye(len(actions))
+    identity = np.eye(count)
 
-    def error(commands: NDArray[np.float64], delay: float = 0.0) -> float:
-        changed = [replace(raw, action=raw.action @ commands) for raw in episodes]
-        return max(one.error for one in agreements(changed, system, delay=delay).values())
+    def error(
+        commands: NDArray[np.float64], changed: Callable[[Columns], Columns] = _unchanged, delay: float = 0.0
+    ) -> float:
+        given = [replace(raw, action=raw.action @ commands) for raw in episodes]
+        errors = [one.error for one in agreements(given, system, changed, delay).values()]
+        return max(errors) if errors and all(map(math.isfinite, errors)) else math.inf
 
-    def crossed(i: int, k: int) -> NDArray[np.float64]:
-        order = list(range(len(actions)))
-        order[i], order[k] = k, i
-        return identity[order]
+    there, (i, k) = min((error(_exchange(identity, *pair)), pair) for pair in pairs)
 
-    there, (i, k) = min((error(crossed(*pair)), pair) for pair in pairs)
-    if there >= EXPLAINED_ERROR:
-        return None
-    signs = (-identity, *(identity - 2 * np.diag(row) for row in identity))
-    period = min(_period(raw) for raw in episodes)
-    latest = round(LONGEST_DELAY * system.prediction_time / period)
-    others = [error(identity, late * period) for late in range(latest + 1)] + [error(each) for each in signs]
-    if min(others) <= OTHERS_ERROR_RATIO * there:
+    def others() -> Iterator[float]:
+        """Errors of all that is as simple; the first are those that are the quickest to tell."""
+        for factors in product((1.0, -1.0), repeat=min(count, MOST_SIGNS)):
+            signs = np.ones(count)
+            signs[: len(factors)] = factors
+            yield error(identity * signs)
+        for weak, factor in product(range(count), WEAKER):
+            yield error(identity * np.where(np.arange(count) == weak, factor, 1.0))
+        for joint in system.coordinates:
+            turned = {system.states[column].name for column in joint if column is not None}
+            yield error(identity, partial(_negated, names=turned))
+        period = min(_period(raw) for raw in episodes)
+        for late in range(1, 1 + round(LONGEST_DELAY * system.prediction_time / period)):
+            yield error(identity, delay=late * period)
+
+    if not there < EXPLAINED_ERROR or any(not other > OTHERS_ERROR_RATIO * there for other in others()):
         return None
     return system.actions[i].name, system.actions[k].name
+
+
+def _exchange(identity: NDArray[np.float64], i: int, k: int) -> NDArray[np.float64]:
+    """The matrix that exchanges columns i and k."""
+    order = list(range(len(identity)))
+    order[i], order[k] = k, i
+    return identity[order]
+
+
+def _negated(columns: Columns, names: Collection[str]) -> Columns:
+    return {name: -values if name in names else values for name, values in columns.items()}
 
 
 def _only_angle(episodes: Sequence[RawEpisode], system: System) -> str | None:

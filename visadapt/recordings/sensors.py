@@ -28,6 +28,8 @@ MOVING_RANGES = 1e-3
 NOISE_RATIO, FEWEST_NOISY = 1.5, 30
 """Ratio of the variance of row-to-row changes to that of the values, above which a column is taken for white noise
 (whose ratio is 2.0); and the fewest rows with which this is tested."""
+DEAD = "a dead sensor"
+"""What a note says of a velocity that never changes."""
 FROZEN_ROWS = 20
 """Fewest equal readings in a row at which a position is compared with its measured rate."""
 
@@ -78,7 +80,7 @@ def check_sensors(episodes: Sequence[RawEpisode], system: System, note: Note) ->
                     "commanded and measured moves it: is the sensor dead, or does the machine stick? a recording in "
                     "which it moves is right"
                 )
-            note(f"{name} never changes although its position does: a dead sensor; it was left out", str(file[0].path))
+            note(f"{name} never changes although its position does: {DEAD}; it was left out", str(file[0].path))
             dead.add(name)
     return [raw.of([name for name in measured if name not in dead]) for raw in episodes]
 

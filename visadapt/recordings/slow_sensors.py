@@ -190,8 +190,8 @@ def _is_regular(rows: Floats) -> bool:
     values, counts = np.unique(rows, return_counts=True)
     at_random = -np.log(mean) + (values - 1) * np.log1p(-1 / mean)
     gained = float((counts * (np.log(counts / len(rows)) - at_random)).sum())
-    # Each value, one of about `mean` that are likely, and its share were fitted.
-    return gained - len(values) * (1 + float(np.log(mean))) > LEAST_LOG_ODDS
+    # Each value's share was fitted; a few numbers that all differ show nothing regular.
+    return len(rows) >= 2 * len(values) and gained - len(values) > LEAST_LOG_ODDS
 
 
 def with_usable(raw: RawEpisode, usable: NDArray[np.bool_], system: System) -> RawEpisode:

@@ -24,9 +24,10 @@ from visadapt.learning.explanation import Explain, Explanation
 from visadapt.policies import Policy
 from visadapt.progress import Report, staged
 from visadapt.recordings import Episode, Recording, RecordingError, load_recording
-from visadapt.recordings.clock import CONVERSION
+from visadapt.recordings.clock import CONVERSION, LEAST_STEPS
+from visadapt.recordings.episode import MisreadError
 from visadapt.recordings.hdf5 import read_stretches
-from visadapt.recordings.loading import TOO_SHORT
+from visadapt.recordings.sensors import DEAD
 from visadapt.setups.nearest import keep_nearest, kept_nearest
 from visadapt.storage.run_folder import read_json, write_json
 from visadapt.targets.base import TargetError
@@ -112,7 +113,11 @@ def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, r
 
 
 def _load(recordings: Sequence[Path], source: World, frames: bool = False) -> Recording:
-    """The recordings of a target, whose readings are converted where it is defined, not where they are read."""
+    """The recordings of a target, whose readings are converted where it is defined, not where they are read.
+
+    Raises:
+        TargetError: they cannot be used; raised from the RecordingError that says so of a file.
+    """
     try:
         return load_recording(recordings, source.system, frames=frames)
     except RecordingError as error:
@@ -127,21 +132,26 @@ def _check_short(recordings: Sequence[Path], episodes: Sequence[Episode], source
     try:
         _load(recordings, source)
     except TargetError as error:
-        if TOO_SHORT not in str(error):
+        if isinstance(error.__cause__, MisreadError):
             raise
 
 
 def doubts(recordings: Sequence[Path], episodes: Sequence[Episode], source: World) -> list[str]:
     """What a target seems to show or take otherwise than the source: signs, units, exchanged or dead readings.
 
-    A quick check, for where no diagnosis is asked for; in words."""
+    A quick check, for where no diagnosis is asked for; in words. Of episodes that are too short for a diagnosis, units
+    and signs are checked alone.
+    """
     if turned := opposite_commands(episodes, source):
         return [f"{listed(turned)} of the target{OPPOSITE}, by single steps; --diagnose checks what it shows"]
+    if source.period > source.system.prediction_time / LEAST_STEPS:
+        return []  # too long for a diagnosis, by which readings are checked
+    short, every = _samples(episodes, source.system.prediction_time)
     try:
-        found = _load(recordings, source).warnings
+        return [warning for warning in _load(recordings, source).warnings if DEAD in warning]
     except TargetError as error:
-        found = (str(error),)
-    return [each for each in found if TOO_SHORT not in each]
+        judged = short <= MOST_SHORT * every or isinstance(error.__cause__, MisreadError)
+        return [str(error)] if judged else []
 
 
 def _without_repeats(sets: Sequence[list[Effect]], slight: frozenset[str]) -> list[list[Effect]]:

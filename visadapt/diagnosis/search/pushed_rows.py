@@ -12,7 +12,7 @@ from visadapt.diagnosis.result import Push
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.kalman import forward
 from visadapt.estimation.likelihood import FitState, linear_problem, variances
-from visadapt.estimation.segments import stretches_without
+from visadapt.estimation.segments import Segments, stretches_without
 from visadapt.recordings import Recording
 from visadapt.systems import System
 
@@ -31,17 +31,18 @@ def depart_from(model: CandidateModel, fits: FitState, pushes: Sequence[Push]) -
     if not pushes:
         return ()
     problem = linear_problem([model], fits).data()
-    innovations = forward(problem, *variances(model, fits, problem)).white[..., 0].square() * model.rows.used
-    return tuple(push for push in pushes if _departs(model, innovations, push))
+    used = model.shown(fits.theta[0])[1]
+    squared = forward(problem, *variances(model, fits, problem)).white[..., 0].square() * used
+    return tuple(push for push in pushes if not _is_as_predicted(model.rows, squared, used, push))
 
 
-def _departs(model: CandidateModel, squared: Tensor, push: Push) -> bool:
-    """Whether innovations (W, T, m), squared and over their variance, are too large for noise during a push."""
-    rows = model.rows
+def _is_as_predicted(rows: Segments, squared: Tensor, used: Tensor, push: Push) -> bool:
+    """Whether innovations (W, T, m), squared and over their variance, are those of noise during a push; not where none
+    of the readings is `used` (W, T, m)."""
     during = (rows.episode == push.episode)[:, None] & (rows.inside > 0)
     during &= (rows.time >= push.start) & (rows.time <= push.end + rows.period)
-    half = rows.used[during].sum() / 2
-    return bool(torch.special.gammaincc(half.clamp(min=0.5), squared[during].sum() / 2) < WITHIN_NOISE)
+    count = used[during].sum()
+    return bool(count) and bool(torch.special.gammaincc(count / 2, squared[during].sum() / 2) >= WITHIN_NOISE)
 
 
 def share_left_out(pushes: Sequence[Push], recording: Recording, system: System) -> float:

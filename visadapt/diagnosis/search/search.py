@@ -58,7 +58,8 @@ POLISH_MODELS = 8
 """Log posterior odds behind the best set up to which sets are fitted carefully, POLISH_MODELS at most. Sets with fewer
 parameters than the best may be farther behind, since a quick fit of the right set may keep too much process noise."""
 
-SETTLED_STEP, LAST_STEP = MAX_EFFECTS + 3, 2 * MAX_EFFECTS
+SETTLED_STEP = MAX_EFFECTS + 3
+LAST_STEP = SETTLED_STEP + 3
 """Steps of progress after which the sets near the best are fitted, and after which all else is: where much stays
 unexplained, either takes as long as three additions of an effect."""
 
