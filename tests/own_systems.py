@@ -135,7 +135,7 @@ class DoublePendulum(System):
         Variable("torque_2", "N m", -6.0, 6.0),
     )
     loads = (Variable("shoulder", "N m", -3.0, 3.0), Variable("elbow", "N m", -3.0, 3.0))
-    coordinates = ((0, 2), (1, 3))
+    coordinates: ClassVar[tuple[tuple[int | None, int], ...]] = ((0, 2), (1, 3))
 
     def derivative(self, state, command, load):
         q1, q2, v1, v2 = state.unbind(-1)
