@@ -11,8 +11,9 @@ from visadapt.diagnosis.result import SCHEMA_VERSION
 from visadapt.diagnosis.verdict import CLOSES_BUT
 from visadapt.effects import EFFECTS
 from visadapt.recordings import read_recording
-from visadapt.setups.explained import doubts, explained
+from visadapt.setups.explained import explained
 from visadapt.setups.nearest import kept_nearest
+from visadapt.setups.target_checks import doubts
 from visadapt.storage.run_folder import read_json, write_json
 from visadapt.targets import TargetError, synthetic
 

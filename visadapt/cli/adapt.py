@@ -20,8 +20,9 @@ from visadapt.diagnosis.words import number, with_unit
 from visadapt.effects import Effect, Parameter
 from visadapt.learning.explanation import Explanation
 from visadapt.policies import ImagePolicy
-from visadapt.setups.explained import check_diagnosable, doubts
+from visadapt.setups.explained import check_diagnosable
 from visadapt.setups.policy_file import save_policy
+from visadapt.setups.target_checks import doubts
 from visadapt.setups.training import adapt, setup_to_adapt
 from visadapt.storage.run_folder import alone_in, open_run, write_json
 from visadapt.tasks.references import read_reference

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -18,28 +16,24 @@ from visadapt.diagnosis.planning import plan
 from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, UNEXPLAINED
 from visadapt.diagnosis.saved import load_explanations
 from visadapt.diagnosis.verdict import CLOSES_BUT
-from visadapt.diagnosis.words import DERIVED, OPPOSITE, listed
+from visadapt.diagnosis.words import DERIVED, listed
 from visadapt.effects import Effect
+from visadapt.effects.catalogue import twins
 from visadapt.learning.explanation import Explain, Explanation
 from visadapt.policies import Policy
 from visadapt.progress import Report, staged
-from visadapt.recordings import Episode, Recording, RecordingError, load_recording
-from visadapt.recordings.clock import CONVERSION, LEAST_STEPS
-from visadapt.recordings.episode import MisreadError
 from visadapt.recordings.hdf5 import read_stretches
-from visadapt.recordings.sensors import DEAD
 from visadapt.setups.nearest import keep_nearest, kept_nearest
+from visadapt.setups.target_checks import (
+    MOST_SHORT,
+    check_short,
+    load_samples,
+    refuse_opposite_signs,
+    samples_in_short,
+)
 from visadapt.storage.run_folder import read_json, write_json
-from visadapt.targets.base import TargetError
+from visadapt.systems import System
 from visadapt.world import World
-
-MOST_SHORT = 0.5
-"""Share of the samples in episodes that are too short beyond which the others are not diagnosed: where the policy falls
-at once, what it does before says little."""
-
-OPPOSITE_ERROR = 0.25
-"""Mean square error of single steps with the opposite sign, over that with the source's, below which the target's sign
-is the opposite one."""
 
 WORTH_NAMING = 0.5  # Share of an unexplained gap from which on the effects that close it are named
 MOST_NAMED = 3  # Effects; a longer list that leaves the gap unexplained says nothing of the machine
@@ -65,13 +59,13 @@ def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, r
 
     def explain(recordings: Sequence[Path], path: Path) -> Explanation:
         episodes = [one for each in recordings for one in read_stretches(each, frames=False)[0].values()]
-        short, every = _samples(episodes, shortest)
+        short, every = samples_in_short(episodes, shortest)
         if short > MOST_SHORT * every:
             if renderer is None:
-                _check_short(recordings, episodes, source)
+                check_short(recordings, episodes, source)
             verdict = f"{short} of {every} samples are in episodes shorter than {shortest:g} s, not diagnosed"
             return Explanation(verdict, [], complete=False)
-        recording = _load(recordings, source, frames=renderer is not None)
+        recording = load_samples(recordings, source, frames=renderer is not None)
         diagnosed = partial(diagnose, recording, source, seed=seed, progress=report, renderer=renderer)
         found = None
         if not path.exists():
@@ -79,7 +73,7 @@ def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, r
             keep_nearest(found, path)
             write_json(path, found.to_json())
         content = read_json(path)
-        _refuse_opposite_signs(path, content["warnings"])
+        refuse_opposite_signs(path, content["warnings"])
         verdict = content["verdict"]
         slight = frozenset(cause["effect"] for cause in content["causes"] if cause["slight"])
         effects: list[Effect] = []
@@ -103,7 +97,8 @@ def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, r
         # A policy that is shown derived velocities acts on what no effect in the world stands for.
         left = any(DERIVED in warning or warning.startswith(CLOSES_BUT) for warning in content["warnings"])
         complete = verdict != UNEXPLAINED and not left
-        designs = experiment if verdict == AMBIGUOUS and renderer is None else None
+        separable = not all(_differ_by_twins(effects, each, source.system) for each in others)
+        designs = experiment if verdict == AMBIGUOUS and renderer is None and separable else None
         nearest = _nearest(content["ranking"]) if verdict == UNEXPLAINED and not effects else ""
         return Explanation(
             verdict, effects, complete, slight, others, nearest, tuple(content["warnings"]), experiment=designs
@@ -112,46 +107,11 @@ def explained(source: World, renderer: nn.Module | None = None, seed: int = 0, r
     return explain
 
 
-def _load(recordings: Sequence[Path], source: World, frames: bool = False) -> Recording:
-    """The recordings of a target, whose readings are converted where it is defined, not where they are read.
-
-    Raises:
-        TargetError: they cannot be used; raised from the RecordingError that says so of a file.
-    """
-    try:
-        return load_recording(recordings, source.system, frames=frames)
-    except RecordingError as error:
-        problem = CONVERSION.sub("", str(error))
-        raise TargetError(f"{problem}; mend it in the target, or its map, and begin in another folder") from error
-
-
-def _check_short(recordings: Sequence[Path], episodes: Sequence[Episode], source: World) -> None:
-    """Raises TargetError where episodes that are too short for a diagnosis show a wrong unit or an opposite sign."""
-    if turned := opposite_commands(episodes, source):
-        raise _opposite(recordings[0], listed(turned))
-    try:
-        _load(recordings, source)
-    except TargetError as error:
-        if isinstance(error.__cause__, MisreadError):
-            raise
-
-
-def doubts(recordings: Sequence[Path], episodes: Sequence[Episode], source: World) -> list[str]:
-    """What a target seems to show or take otherwise than the source: signs, units, exchanged or dead readings.
-
-    A quick check, for where no diagnosis is asked for; in words. Of episodes that are too short for a diagnosis, units
-    and signs are checked alone.
-    """
-    if turned := opposite_commands(episodes, source):
-        return [f"{listed(turned)} of the target{OPPOSITE}, by single steps; --diagnose checks what it shows"]
-    if source.period > source.system.prediction_time / LEAST_STEPS:
-        return []  # too long for a diagnosis, by which readings are checked
-    short, every = _samples(episodes, source.system.prediction_time)
-    try:
-        return [warning for warning in _load(recordings, source).warnings if DEAD in warning]
-    except TargetError as error:
-        judged = short <= MOST_SHORT * every or isinstance(error.__cause__, MisreadError)
-        return [str(error)] if judged else []
+def _differ_by_twins(one: Sequence[Effect], other: Sequence[Effect], system: System) -> bool:
+    """Whether two explanations differ in effects alone that no data of the system tell apart."""
+    left = [type(effect) for effect in one if all(effect.name != each.name for each in other)]
+    right = [type(effect) for effect in other if all(effect.name != each.name for each in one)]
+    return len(left) == len(right) and all(twins(effect, right, system) for effect in left)
 
 
 def _without_repeats(sets: Sequence[list[Effect]], slight: frozenset[str]) -> list[list[Effect]]:
@@ -184,48 +144,3 @@ def check_diagnosable(source: World, longest: int) -> None:
             f"{source.system.prediction_time:g} s ahead: rounds, and episodes, of at least {least} samples are right; "
             "a system of your own that is fast states a shorter prediction_time"
         )
-
-
-def _samples(episodes: Sequence[Episode], shortest: float) -> tuple[int, int]:
-    """Samples in episodes shorter than `shortest` s, and in all."""
-    short = [one.samples for one in episodes if one.time[-1] - one.time[0] < shortest * (1 - 1e-6)]
-    return sum(short), sum(one.samples for one in episodes)
-
-
-def opposite_commands(episodes: Sequence[Episode], source: World) -> list[str]:
-    """The commands that the target takes with the opposite sign: single steps say so of episodes that are too short for
-    a diagnosis, as where the policy drives the target the wrong way."""
-    rows = [(one.state, one.action[:-1]) for one in episodes if one.state is not None]
-    if not rows:
-        return []
-    parts = [state[:-1] for state, _ in rows], [state[1:] for state, _ in rows], [action for _, action in rows]
-    state, after, command = (torch.from_numpy(np.concatenate(part)).double() for part in parts)
-    size, world = (after - state).square().mean(0).clamp(min=1e-300), copy.deepcopy(source).double()
-
-    def error(signs: Tensor) -> float:
-        """Mean square error of a step, over the changes of the states."""
-        with torch.no_grad():
-            stepped = world.step(world.start(state), signs * command).state
-        return float(((stepped - after).square().mean(0) / size).mean())
-
-    actions = source.system.actions
-    each = 1 - 2 * torch.eye(len(actions), dtype=torch.float64)
-    signs = min((*each, -torch.ones_like(each[0])), key=error)
-    if not error(signs) < OPPOSITE_ERROR * error(torch.ones_like(signs)):
-        return []
-    return [action.name for action, sign in zip(actions, signs.tolist(), strict=True) if sign < 0]
-
-
-def _refuse_opposite_signs(path: Path, warnings: Sequence[str]) -> None:
-    """Raises TargetError where a diagnosis, kept in `path`, warns that the target's sign of something is opposite."""
-    for warning in warnings:
-        name, opposite, _ = warning.partition(OPPOSITE)
-        if opposite:
-            raise _opposite(path, name)
-
-
-def _opposite(path: Path, name: str) -> TargetError:
-    return TargetError(
-        f"{path}: {name} of the target{OPPOSITE}, so that the policy would drive it the wrong way: negate it in the "
-        "target, by scale = -1.0 in a map, and begin in another folder"
-    )
