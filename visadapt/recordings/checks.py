@@ -16,12 +16,11 @@ from visadapt.recordings.attitude import check_attitude
 from visadapt.recordings.axes import check_axes
 from visadapt.recordings.clock import GAP_PERIODS, UNITS_S, Note, RawEpisode
 from visadapt.recordings.episode import MisreadError, RecordingError
+from visadapt.recordings.exchanged_columns import exchanged, exchanged_commands
 from visadapt.recordings.physics import (
     DEGREE,
     are_degrees,
     correlation,
-    exchanged,
-    exchanged_commands,
     is_half_a_turn_off,
     is_turned_round,
     rows_apart,

@@ -8,10 +8,7 @@ differences of positions or differences of measured rates, are compared with the
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import replace
-from functools import partial
-from itertools import combinations, product
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -35,9 +32,6 @@ EXPLAINED_ERROR, OTHERS_ERROR_RATIO = 0.75, 1.5
 another zero or sign explains these; and how many times as large the error of the angle as it is must be."""
 EXPLAINED_CORRELATION = 0.5
 """Correlation of measured and predicted accelerations above which the source explains them."""
-
-WEAKER, MOST_SIGNS = (0.3, 0.5, 0.7, 0.85), 5
-"""Factors of one command that are tried before two are called exchanged, and how many may have the other sign."""
 
 TURNS = ("omega_x", "omega_y", "omega_z")
 """Rates of turn of a vehicle, which are no variable's rate, and whose changes are judged as accelerations are; so are a
@@ -107,14 +101,14 @@ def is_half_a_turn_off(episodes: Sequence[RawEpisode], system: System) -> bool:
         return {name: values + math.pi if name == angle else values for name, values in columns.items()}
 
     def negated(columns: Columns) -> Columns:
-        return _negated(columns, (angle, rate or angle))
+        return with_opposite(columns, (angle, rate or angle))
 
     def error(changed: Callable[[Columns], Columns]) -> float:
         return agreements(episodes, system, changed)[angle].error
 
     there = error(further)
     return there < EXPLAINED_ERROR and all(
-        error(changed) > OTHERS_ERROR_RATIO * there for changed in (_unchanged, negated)
+        error(changed) > OTHERS_ERROR_RATIO * there for changed in (unchanged, negated)
     )
 
 
@@ -137,84 +131,6 @@ def is_in_newtons(episodes: Sequence[RawEpisode], system: System, largest: float
     found = agreements(episodes, system).values()
     slopes = [one.slope for one in found if one.correlation > EXPLAINED_CORRELATION]
     return bool(slopes) and all(1 / 3 < slope * largest < 3 for slope in slopes)
-
-
-def exchanged(episodes: Sequence[RawEpisode], system: System, one: str, other: str) -> bool:
-    """Whether the source explains both accelerations with two columns (and their rates) exchanged, and not as they are.
-
-    A delayed command could look like that, so every delay up to `LONGEST_DELAY` is tried for the columns as
-    they are. False where that cannot be decided.
-    """
-    if not can_decide(episodes, system, (one, other)):
-        return False
-    rate, other_rate = system.rate_of(one) or "", system.rate_of(other) or ""
-    to = {one: other, other: one, rate: other_rate, other_rate: rate}
-
-    def swapped(columns: Columns) -> Columns:
-        return {to.get(name, name): values for name, values in columns.items()}
-
-    def correlations(found: Mapping[str, Agreement]) -> tuple[float, float]:
-        return found[one].correlation, found[other].correlation
-
-    crossed = agreements(episodes, system, swapped)
-    if not all(1 / 4 < crossed[name].slope < 4 for name in (one, other)):
-        return False
-    period = min(_period(raw) for raw in episodes)
-    latest = round(LONGEST_DELAY * system.prediction_time / period)
-    unchanged = [correlations(agreements(episodes, system, delay=k * period)) for k in range(latest + 1)]
-    explained = min(correlations(crossed))
-    return explained > EXPLAINED_CORRELATION and max(map(min, unchanged)) < 0.7 * explained and max(unchanged[0]) < 0
-
-
-def exchanged_commands(episodes: Sequence[RawEpisode], system: System) -> tuple[str, str] | None:
-    """Two commands of one unit with which the source explains every acceleration if they are exchanged, and not as they
-    are, late, weaker or with other signs, nor with a joint's sign turned, as where exchanged wheels turn a robot the
-    other way; None where there are none, or where that cannot be decided."""
-    names = [variable.name for variable in system.states if system.rate_of(variable.name)]
-    count = len(system.actions)
-    pairs = [(i, k) for i, k in combinations(range(count), 2) if system.actions[i].unit == system.actions[k].unit]
-    if not pairs or not can_decide(episodes, system, names):
-        return None
-    identity = np.eye(count)
-
-    def error(
-        commands: NDArray[np.float64], changed: Callable[[Columns], Columns] = _unchanged, delay: float = 0.0
-    ) -> float:
-        given = [replace(raw, action=raw.action @ commands) for raw in episodes]
-        errors = [one.error for one in agreements(given, system, changed, delay).values()]
-        return max(errors) if errors and all(map(math.isfinite, errors)) else math.inf
-
-    there, (i, k) = min((error(_exchange(identity, *pair)), pair) for pair in pairs)
-
-    def others() -> Iterator[float]:
-        """Errors of all that is as simple; the first are those that are the quickest to tell."""
-        for factors in product((1.0, -1.0), repeat=min(count, MOST_SIGNS)):
-            signs = np.ones(count)
-            signs[: len(factors)] = factors
-            yield error(identity * signs)
-        for weak, factor in product(range(count), WEAKER):
-            yield error(identity * np.where(np.arange(count) == weak, factor, 1.0))
-        for joint in system.coordinates:
-            turned = {system.states[column].name for column in joint if column is not None}
-            yield error(identity, partial(_negated, names=turned))
-        period = min(_period(raw) for raw in episodes)
-        for late in range(1, 1 + round(LONGEST_DELAY * system.prediction_time / period)):
-            yield error(identity, delay=late * period)
-
-    if not there < EXPLAINED_ERROR or any(not other > OTHERS_ERROR_RATIO * there for other in others()):
-        return None
-    return system.actions[i].name, system.actions[k].name
-
-
-def _exchange(identity: NDArray[np.float64], i: int, k: int) -> NDArray[np.float64]:
-    """The matrix that exchanges columns i and k."""
-    order = list(range(len(identity)))
-    order[i], order[k] = k, i
-    return identity[order]
-
-
-def _negated(columns: Columns, names: Collection[str]) -> Columns:
-    return {name: -values if name in names else values for name, values in columns.items()}
 
 
 def _only_angle(episodes: Sequence[RawEpisode], system: System) -> str | None:
@@ -241,26 +157,33 @@ def can_decide(episodes: Sequence[RawEpisode], system: System, names: Sequence[s
 def _judged(episodes: Sequence[RawEpisode], system: System) -> list[RawEpisode]:
     """The episodes that are long enough for second differences after the longest delay."""
     latest = LONGEST_DELAY * system.prediction_time
-    return [raw for raw in episodes if len(raw.time) > 2 * rows_apart(raw, system) + 1 + round(latest / _period(raw))]
+    return [raw for raw in episodes if len(raw.time) > 2 * rows_apart(raw, system) + 1 + round(latest / period_of(raw))]
 
 
-def _period(raw: RawEpisode) -> float:
+def period_of(raw: RawEpisode) -> float:
+    """s between the rows of an episode, in the median."""
     return float(np.median(np.diff(raw.time[:MOST_ROWS])))
 
 
 def rows_apart(raw: RawEpisode, system: System) -> int:
     """Rows between those whose difference is taken."""
-    return max(1, round(DIFFERENCE * system.prediction_time / _period(raw)))
+    return max(1, round(DIFFERENCE * system.prediction_time / period_of(raw)))
 
 
-def _unchanged(columns: Columns) -> Columns:
+def unchanged(columns: Columns) -> Columns:
+    """The columns as they are."""
     return columns
+
+
+def with_opposite(columns: Columns, names: Collection[str]) -> Columns:
+    """Columns of which some have the other sign."""
+    return {name: -values if name in names else values for name, values in columns.items()}
 
 
 def agreements(
     episodes: Sequence[RawEpisode],
     system: System,
-    changed: Callable[[Columns], Columns] = _unchanged,
+    changed: Callable[[Columns], Columns] = unchanged,
     delay: float = 0.0,
 ) -> dict[str, Agreement]:
     """For each variable with a rate, and each rate or speed of no variable: how its acceleration follows the source's.
@@ -287,7 +210,7 @@ def _accelerations(
     columns = {name: np.unwrap(values) if name in angles else values for name, values in columns.items()}
     action = raw.action[:MOST_ROWS]
     stride = rows_apart(raw, system)
-    span = 2 * stride * _period(raw)
+    span = 2 * stride * period_of(raw)
     # The mean of three points has noise that is uncorrelated with that of their second difference.
     middle = {
         name: (values[: -2 * stride] + values[stride:-stride] + values[2 * stride :]) / 3
@@ -297,7 +220,7 @@ def _accelerations(
     for name, rate in rates.items():
         middle.setdefault(rate, (columns[name][2 * stride :] - columns[name][: -2 * stride]) / span)
     # The mean command over the span.
-    late = round(delay / _period(raw))
+    late = round(delay / period_of(raw))
     action = np.vstack([np.repeat(action[:1], late, axis=0), action[: len(action) - late]])
     kernel = np.ones(2 * stride) / (2 * stride)
     action = np.column_stack([np.convolve(column[:-1], kernel, "valid") for column in action.T])
