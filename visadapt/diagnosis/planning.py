@@ -124,7 +124,7 @@ def plan(
             about 0 where that is inside the command's range, otherwise about the mean of those recorded.
         samples: length of the experiment, in commands.
         seed: of all noise drawn.
-        progress: called with (excitations tried, excitations in all, best log odds so far).
+        progress: called with (excitations tried, excitations in all, nan).
 
     Raises:
         ValueError: the diagnosis is not ambiguous, the recording has no states, or the machine leaves the ranges of its

@@ -69,9 +69,8 @@ def verdict_of(
     if math.isnan(gap.closed) and not repeats:
         return nothing  # the source predicts as well as the noise allows
     if unexplained:
-        enough = comparison.negligible and not improvable
-        if gap.before > LOW_NOISE * gap.floor:
-            enough = gap.closed >= MIN_GAP_CLOSED
+        low_noise = gap.before > LOW_NOISE * gap.floor
+        enough = gap.closed >= MIN_GAP_CLOSED if low_noise else comparison.negligible and not improvable
         if not (comparison.best.effects and enough):
             return UNEXPLAINED
     carrying = without_slight(explaining)
