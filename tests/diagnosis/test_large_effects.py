@@ -3,15 +3,14 @@
 import math
 
 import pytest
-import torch
 
 import visadapt as va
+from tests.creep import Creep
 from tests.diagnosed import record
 from visadapt.diagnosis.search.preparation import prepare
 from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.verdict import CLOSES_BUT
 from visadapt.effects import (
-    EFFECTS,
     CartMass,
     CoulombFriction,
     MeasurementDelay,
@@ -55,25 +54,11 @@ def test_an_effect_that_does_what_a_simpler_one_does_is_exchanged_for_it():
     assert search.best.fits.theta.item() == pytest.approx(2.0, rel=0.01)
 
 
-class CreepingFriction(va.DynamicsEffect):
-    """Dry friction of 3 N that lets the cart creep, as MuJoCo's does."""
-
-    name = "creeping_friction"
-    table = ()
-
-    def load(self, time, state, system):
-        force = -3.0 * (state[:, 1] / 0.01).tanh()
-        return torch.stack((force, torch.zeros_like(force)), -1)
-
-
-EFFECTS.pop("creeping_friction")  # no cause that a diagnosis may name
-
-
 @pytest.mark.parametrize("noise", [1e-3, 1e-2])
 def test_what_nearly_describes_a_large_effect_is_named_with_a_warning_whatever_the_noise(noise, only_effects):
     only_effects("coulomb_friction", "viscous_friction", "actuator_gain")
     states = [state.name for state in CartPole.states]
-    recording = record([CreepingFriction()], episodes=4, rows=150, measured=states, noise=(noise,) * 4)
+    recording = record([Creep(0.01)], episodes=4, rows=150, measured=states, noise=(noise,) * 4)
     found = va.diagnose(recording, va.World(CartPole()))
     assert found.verdict == "identified"
     assert (found.gap.after > 3 * found.gap.floor) == (noise == 1e-3)

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 import visadapt as va
+from tests.creep import Creep
 from tests.own_systems import Pendulum
 from visadapt.diagnosis import excitations, planning
 from visadapt.diagnosis.result import SCHEMA_VERSION
@@ -150,24 +151,10 @@ def test_what_named_causes_leave_is_left_to_a_residual(tmp_path, only_effects):
     assert [effect.name for effect in left.effects] == ["viscous_friction"]
 
 
-class Creep(va.DynamicsEffect):
-    """Dry friction of 3 N that lets the cart creep, as none of the library's does."""
-
-    name = "creep"
-    table = ()
-
-    def load(self, time, state, system):
-        force = -3.0 * (state[:, 1] / 0.1).tanh()
-        return torch.stack((force, torch.zeros_like(force)), -1)
-
-
-EFFECTS.pop("creep")  # no cause that a diagnosis may name
-
-
 def test_where_an_unexplained_gap_is_nearly_closed_a_residual_is_to_learn_the_rest_alone(tmp_path, only_effects):
     only_effects("coulomb_friction", "actuator_gain")
     policy, generator = va.load_policy(va.shipped("cartpole_states")), torch.Generator().manual_seed(0)
-    target = va.SyntheticTarget(lambda batch, generator: [Creep()])
+    target = va.SyntheticTarget(lambda batch, generator: [Creep(0.1)])
     va.write_recording(tmp_path / "a.h5", [va.run(target, policy, 1, 200, generator, exploration=0.3)[0].episode])
     explain, path = explained(va.World(va.CartPole())), tmp_path / "found.json"
     for explanation in (explain([tmp_path / "a.h5"], path), explain([tmp_path / "a.h5"], path)):

@@ -10,7 +10,7 @@ import numpy as np
 
 from visadapt.recordings.clock import RawEpisode
 from visadapt.recordings.episode import MisreadError
-from visadapt.recordings.physics import EXPLAINED_ERROR, TURNS, Columns, agreements, can_decide
+from visadapt.recordings.physics import EXPLAINED_ERROR, TURNS, Columns, agreements, can_decide, with_opposite
 from visadapt.systems import RigidBody, System
 
 TO_RIGHT = ("y", "y_dot", "q_y", "q_z", "omega_y", "omega_z")
@@ -97,7 +97,7 @@ def _error(
     then turned by a quarter or not."""
 
     def changed(columns: Columns) -> Columns:
-        signed = {name: -values if name in opposite else values for name, values in columns.items()}
+        signed = with_opposite(columns, opposite)
         return {QUARTER.get(name, name) if quarter else name: values for name, values in signed.items()}
 
     found = agreements(episodes, system, changed)

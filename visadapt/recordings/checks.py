@@ -43,7 +43,7 @@ IS_RATE_CORRELATION, NOT_RATE_CORRELATION = 0.8, 0.3
 
 
 def check_finite(raw: RawEpisode, actions: Sequence[Variable]) -> None:
-    """Raises MisreadError that names the first cell that is not finite."""
+    """Raises RecordingError that names the first cell that is not finite."""
     table = np.column_stack([raw.time, raw.state, raw.action])
     bad = ~np.isfinite(table)
     if bad.any():

@@ -116,14 +116,17 @@ class RawEpisode:
         where no file's column is read, or an offset was given."""
         if name not in self.names or (name in self.given and read_column(self.given[name], self.names.values()).offset):
             return ""
-        return f"; --columns {name}={self.given.get(name) or self.names[name]}{how} converts"
+        return f"; --columns {name}={self._read_as(name)}{how} converts"
 
     def exchange(self, one: str, other: str) -> str:
         """The end of a message: how a user has two variables exchange their columns; empty where no file's is read."""
         if one not in self.names or other not in self.names:
             return ""
-        columns = {name: self.given.get(name) or self.names[name] for name in (one, other)}
-        return f"; --columns {one}={columns[other]},{other}={columns[one]} converts"
+        return f"; --columns {one}={self._read_as(other)},{other}={self._read_as(one)} converts"
+
+    def _read_as(self, name: str) -> str:
+        """The file's column of a variable, perhaps with a conversion that the user gave."""
+        return self.given.get(name) or self.names[name]
 
     def cell(self, row: int, name: str) -> str:
         """Where in the file a value stands, for messages."""

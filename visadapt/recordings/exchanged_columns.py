@@ -70,36 +70,36 @@ def exchanged_commands(episodes: Sequence[RawEpisode], system: System) -> tuple[
     identity = np.eye(count)
 
     def error(
-        commands: NDArray[np.float64], changed: Callable[[Columns], Columns] = unchanged, delay: float = 0.0
+        commands: NDArray[np.float64] = identity,
+        changed: Callable[[Columns], Columns] = unchanged,
+        delay: float = 0.0,
     ) -> float:
         given = [replace(raw, action=raw.action @ commands) for raw in episodes]
         errors = [one.error for one in agreements(given, system, changed, delay).values()]
         return max(errors) if errors and all(map(math.isfinite, errors)) else math.inf
 
-    there, (i, k) = min((error(_exchange(identity, *pair)), pair) for pair in pairs)
+    there, (i, k) = min((error(_exchanging(count, *pair)), pair) for pair in pairs)
 
     def others() -> Iterator[float]:
         """Errors of all that is as simple; the first are those that are the quickest to tell."""
-        for factors in product((1.0, -1.0), repeat=min(count, MOST_SIGNS)):
-            signs = np.ones(count)
-            signs[: len(factors)] = factors
-            yield error(identity * signs)
+        for signs in product((1.0, -1.0), repeat=min(count, MOST_SIGNS)):
+            yield error(np.diag(np.append(signs, np.ones(count - len(signs)))))
         for weak, factor in product(range(count), WEAKER):
-            yield error(identity * np.where(np.arange(count) == weak, factor, 1.0))
+            yield error(np.diag(np.where(np.arange(count) == weak, factor, 1.0)))
         for joint in system.coordinates:
             turned = {system.states[column].name for column in joint if column is not None}
-            yield error(identity, partial(with_opposite, names=turned))
+            yield error(changed=partial(with_opposite, names=turned))
         period = min(period_of(raw) for raw in episodes)
         for late in range(1, 1 + round(LONGEST_DELAY * system.prediction_time / period)):
-            yield error(identity, delay=late * period)
+            yield error(delay=late * period)
 
     if not there < EXPLAINED_ERROR or any(not other > OTHERS_ERROR_RATIO * there for other in others()):
         return None
     return system.actions[i].name, system.actions[k].name
 
 
-def _exchange(identity: NDArray[np.float64], i: int, k: int) -> NDArray[np.float64]:
-    """The matrix that exchanges columns i and k."""
-    order = list(range(len(identity)))
-    order[i], order[k] = k, i
-    return identity[order]
+def _exchanging(count: int, i: int, k: int) -> NDArray[np.float64]:
+    """The matrix that exchanges commands i and k of `count`."""
+    out = np.eye(count)
+    out[[i, k]] = out[[k, i]]
+    return out

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -34,8 +35,7 @@ EXPLAINED_CORRELATION = 0.5
 """Correlation of measured and predicted accelerations above which the source explains them."""
 
 TURNS = ("omega_x", "omega_y", "omega_z")
-"""Rates of turn of a vehicle, which are no variable's rate, and whose changes are judged as accelerations are; so are a
-joint's speeds without a position."""
+"""Rates of turn of a vehicle, which are no variable's rate, and whose changes are judged as accelerations are."""
 
 Columns = Mapping[str, NDArray[np.float64]]
 
@@ -100,8 +100,7 @@ def is_half_a_turn_off(episodes: Sequence[RawEpisode], system: System) -> bool:
     def further(columns: Columns) -> Columns:
         return {name: values + math.pi if name == angle else values for name, values in columns.items()}
 
-    def negated(columns: Columns) -> Columns:
-        return with_opposite(columns, (angle, rate or angle))
+    negated = partial(with_opposite, names=(angle, rate or angle))
 
     def error(changed: Callable[[Columns], Columns]) -> float:
         return agreements(episodes, system, changed)[angle].error
@@ -234,6 +233,7 @@ def _accelerations(
         if rate in columns:
             measured.append((columns[rate][2 * stride :] - columns[rate][: -2 * stride]) / span)
         found[name] = np.stack(measured), predicted[:, names.index(rate)]
+    # The speeds of joints without a position are judged as a vehicle's rates of turn are.
     speeds = {names[velocity] for position, velocity in system.coordinates if position is None}
     for name in sorted({*TURNS, *speeds} & {*columns}):
         measured = [(columns[name][2 * stride :] - columns[name][: -2 * stride]) / span]
