@@ -160,6 +160,14 @@ def test_sensors_of_an_angle_scale_its_rate_too_and_an_offset_does_not():
     assert world.reading(STATE)[0].tolist() == pytest.approx([0.6, 1.3, 4.0, -3.0])
 
 
+@pytest.mark.parametrize(("effect", "column"), [("arm.position_scale", 0), ("arm_rate.sensor_scale", 2)])
+def test_an_angle_and_its_rate_may_have_a_scale_of_their_own(effect, column):
+    read = World(FURUTA, [BY_NAME[effect](scale=2.0)]).reading(STATE)[0]
+    expected = STATE[0].clone()
+    expected[column] *= 2
+    assert read.tolist() == pytest.approx(expected.tolist())
+
+
 @pytest.mark.parametrize("turned", [1, -1])
 def test_a_scale_acts_before_an_offset_whichever_is_named_first(turned):
     effects = [BY_NAME["arm.sensor_scale"](scale=2.0), BY_NAME["arm.sensor_offset"](offset=0.1)]

@@ -67,7 +67,7 @@ class SensorScale(SensingEffect):
 
 
 class SensorGain(SensingEffect):
-    """A sensor whose counts per unit differ from those assumed; a velocity that is read from it scales too."""
+    """A sensor whose counts per unit differ from those assumed."""
 
     source = "Ding (2013), Model-Based Fault Diagnosis Techniques, section 3.5 (multiplicative sensor fault)"
     columns: ClassVar[list[int]]  # the states that it reads

@@ -41,7 +41,7 @@ SHORT_PERIOD = 0.005
 """s: up to it the midpoint rule is accurate enough for what is not reported, and takes half as long, unless the system
 is stiff."""
 
-MIDPOINT_SHARE = 0.1  # Longest period with the midpoint rule, over the longest step of Runge-Kutta
+MIDPOINT_SHARE = 0.1  # Longest step of the midpoint rule, over that of Runge-Kutta
 
 STEPS_WHERE_LATE = 4
 """Steps in a row, for what is reported, where motors follow their commands late: what acts changes within the row, and
@@ -82,13 +82,21 @@ class CandidateModel:
             smooth_step = min([self.profile.longest_step, *(stable_step(*own, effect) for effect in effects)])  # type: ignore[arg-type]  # hashable, as types
         if accuracy == FINE:
             smooth_step = min(smooth_step, self.profile.fine_step)
-        step = smooth_step = min(smooth_step, rows.longest_step)
+        late = any(follows_late(effect, system) for effect in effects)
+        # Several steps a row, as a fast motion asks for, add little to the screening but where a command is late.
+        if accuracy > COARSEST or late:
+            smooth_step = min(smooth_step, rows.longest_step)
+        step = smooth_step
         if any(effect.abrupt for effect in effects):
             step = min(smooth_step, self.profile.longest_abrupt_steps[accuracy])
-        if accuracy == FINE and any(follows_late(effect, system) for effect in effects):
+        if accuracy == FINE and late:
             step = min(step, rows.period / STEPS_WHERE_LATE)
         longest = float(rows.held.max())
-        short = rows.period <= min(SHORT_PERIOD, MIDPOINT_SHARE * longest_step(system))
+        # The screening compares steps that err alike: the midpoint rule does for longer ones there.
+        screened = accuracy == COARSEST
+        taken = longest / steps_within(longest, step) if screened else rows.period
+        most = rows.longest_step if screened else SHORT_PERIOD
+        short = taken <= min(most, MIDPOINT_SHARE * longest_step(system))
         integrator = "midpoint" if accuracy < FINE and short else "rk4"
         placeholders = [effect(**{parameter.name: 0.0 for parameter in effect.table}) for effect in effects]
         self._world, self._smooth_world = (

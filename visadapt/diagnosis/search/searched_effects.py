@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from visadapt.effects import Effect, Stage
 from visadapt.effects.catalogue import twins
 from visadapt.effects.late_sensors import LateSensors, MeasurementDelay
+from visadapt.effects.sensing import SensorGain
 from visadapt.estimation.effect_fit import remembers
 from visadapt.systems import System
 
@@ -28,12 +29,17 @@ def searched(effects: Iterable[type[Effect]], system: System) -> list[type[Effec
 def shown_by(effects: Sequence[type[Effect]], measured: set[int]) -> list[type[Effect]]:
     """The effects that readings of the columns `measured` can show.
 
-    Left out are effects of a camera; a delay of sensors none of which was read; and a delay of exactly the sensors that
-    were read, if `MeasurementDelay`, which then does the same, is searched too.
+    Left out are effects of a camera; a delay of sensors none of which was read; a delay of exactly the sensors that
+    were read, if `MeasurementDelay`, which then does the same, is searched too; and all scales but the first of the
+    same sensors.
     """
     all_late = any(issubclass(effect, MeasurementDelay) for effect in effects)
+    first: dict[frozenset[int], type[Effect]] = {}
 
     def shows(effect: type[Effect]) -> bool:
+        if issubclass(effect, SensorGain):
+            read = frozenset(measured.intersection(effect.columns))
+            return bool(read) and first.setdefault(read, effect) is effect
         if not issubclass(effect, LateSensors) or issubclass(effect, MeasurementDelay):
             return effect.stage is not Stage.CAMERA
         late = measured & set(effect.late)

@@ -16,8 +16,8 @@ from visadapt.systems.contract import ROUNDING, inputs
 
 
 def on_sensors(system: type[System]) -> Iterator[Made]:
-    """Offset, scale and delay of each sensor (velocities share scale and delay of their positions), and a delay of
-    all."""
+    """Offset, scale and delay of each sensor, and a delay of all. Velocities share scale and delay of their positions,
+    as where both are read from one encoder; beside a tachometer or gyroscope, either may have a scale of its own."""
     rates = system.velocity_of()
     moving = {"positions": list(rates), "velocities": list(rates.values())}
     yield (
@@ -41,6 +41,7 @@ def on_sensors(system: type[System]) -> Iterator[Made]:
             },
         )
         if column in rates.values():
+            yield _scale(f"{name}.sensor_scale", system, [column])
             continue
         scaled = [column, rates[column]] if column in rates else [column]
         both = ", ".join(system.states[one].name for one in scaled)
@@ -70,16 +71,25 @@ def on_sensors(system: type[System]) -> Iterator[Made]:
                     "order": sensing.SensorScale.order - 5,
                 },
             )
-        yield (
-            f"{name}.sensor_scale",
-            sensing.SensorGain,
-            {
-                "equation": f"({both}) measured = scale ({both})",
-                "table": (Parameter("scale", "1", 0.5, 2.0, 1.0, linear=True),),
-                "columns": scaled,
-                "order": sensing.SensorScale.order,
-            },
-        )
+        yield _scale(f"{name}.sensor_scale", system, scaled)
+        if len(scaled) > 1:
+            yield _scale(f"{name}.position_scale", system, [column])
+
+
+def _scale(name: str, system: type[System], columns: list[int]) -> Made:
+    """A sensor that reads the states in these columns, whose counts per unit differ from those assumed."""
+    read = ", ".join(system.states[column].name for column in columns)
+    read = read if len(columns) == 1 else f"({read})"
+    return (
+        name,
+        sensing.SensorGain,
+        {
+            "equation": f"{read} measured = scale {read}",
+            "table": (Parameter("scale", "1", 0.5, 2.0, 1.0, linear=True),),
+            "columns": columns,
+            "order": sensing.SensorScale.order,
+        },
+    )
 
 
 LARGEST_ECCENTRICITY = 0.1  # rad, of the error of an angle sensor within a turn
