@@ -7,7 +7,7 @@ import torch
 from visadapt.diagnosis import diagnose
 from visadapt.diagnosis.next_experiment import EVERY_COMMAND
 from visadapt.diagnosis.search.preparation import prepare
-from visadapt.diagnosis.words import BETWEEN_ROWS, OWN_CLOCK
+from visadapt.diagnosis.words import BETWEEN_ROWS, OWN_CLOCK, THINNED
 from visadapt.effects import ActuatorDelay, ActuatorGain, ViscousFriction
 from visadapt.recordings import Episode, Recording
 from visadapt.recordings.command_clock import instants
@@ -67,3 +67,38 @@ def test_commands_of_the_loop_that_reads_act_from_their_rows_on():
     episode = recording.episodes[0]
     assert instants(episode.time, episode.action) is not None  # a clock of its own would show the same commands
     assert not any(OWN_CLOCK in said for said in prepare(recording, CartPole(), CATALOGUE).warnings)
+
+
+def logged(kept, noise):
+    """6 s of a balanced cart-pole, read every 40 ms, whose commands change every 4 ms; a log keeps one every `kept` ms,
+    and a row has the mean of those that it keeps, each held until the next."""
+    generator = torch.Generator().manual_seed(0)
+    world, row, loop = World(CartPole(), (), STEP), 40, 4
+    at, states, held = world.start(torch.tensor([[0.0, 0.0, 0.02, 0.0]], dtype=torch.float64)), [], []
+    gains = torch.tensor([0.3, 0.4, 3.0, 0.6], dtype=torch.float64)
+    with torch.no_grad():
+        for step in range(6000):
+            if step % loop == 0:
+                aim = 0.1 * np.sin(0.003 * step)
+                command = ((at.state * gains).sum(1, keepdim=True) + aim).clamp(-1, 1)
+            if step % kept == 0:
+                last = command
+            if step % row == 0:
+                states.append(at.state[0, [0, 2]])
+            held.append(last[0])
+            at = world.step(at, command)
+    commands = torch.stack(held).unflatten(0, (-1, row)).mean(1).numpy()
+    clean = torch.stack(states)
+    state = (clean + noise * torch.randn(clean.shape, generator=generator, dtype=torch.float64)).numpy()
+    episode = Episode(STEP * row * np.arange(len(state)), commands, state)
+    return Recording((episode,), ("x", "theta"), STEP * row, ("run.ulg",), stamped_commands=True)
+
+
+@pytest.mark.parametrize(("kept", "late"), [(40, 0.018), (16, 0.006)])
+def test_commands_of_which_a_log_keeps_some_are_moved_by_half_of_what_is_between_them(kept, late):
+    said, why = prepare(logged(kept, 1e-4), CartPole(), CATALOGUE).warnings
+    assert (float(said.split()[3]), why) == (pytest.approx(late, abs=0.003), THINNED)
+
+
+def test_commands_of_which_a_log_keeps_all_act_when_they_were_sent():
+    assert prepare(logged(4, 1e-4), CartPole(), CATALOGUE).warnings == ()

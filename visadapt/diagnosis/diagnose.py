@@ -14,7 +14,7 @@ from visadapt.diagnosis.answer import Answer, answer
 from visadapt.diagnosis.exploration import Explored
 from visadapt.diagnosis.figures_data import disturbances, figure_data, film_frames
 from visadapt.diagnosis.frames import UNSEEN, Film, FramesError, watch, with_camera
-from visadapt.diagnosis.next_experiment import AS_IT_CHANGES, EVERY_COMMAND, OF_ONE_MACHINE
+from visadapt.diagnosis.next_experiment import AS_IT_CHANGES, EVERY_COMMAND, EVERY_SENT, OF_ONE_MACHINE
 from visadapt.diagnosis.result import (
     AMBIGUOUS,
     NO_GAP,
@@ -48,7 +48,7 @@ from visadapt.diagnosis.verdict import (
     one_by_one,
     shown_by_episodes,
 )
-from visadapt.diagnosis.words import A_ROW_LATE, BESIDE_PUSHES, BETWEEN_ROWS, listed, printable
+from visadapt.diagnosis.words import A_ROW_LATE, BESIDE_PUSHES, BETWEEN_ROWS, THINNED, listed, printable
 from visadapt.effects import EFFECTS, Dropout, Effect, FrameDrop, Stage
 from visadapt.effects.catalogue import catalogue as all_effects, sized
 from visadapt.estimation.effect_fit import remembers
@@ -216,6 +216,8 @@ def _next_step(answered: Answer, gap: Gap) -> str:
             return OF_ONE_MACHINE if explored.changes[0].files else AS_IT_CHANGES
         if BETWEEN_ROWS in explored.prepared.warnings:
             return EVERY_COMMAND
+        if THINNED in explored.prepared.warnings:
+            return EVERY_SENT
     return next_step(
         explored.search,
         explored.comparison,

@@ -56,6 +56,12 @@ EVERY_COMMAND = (
 )
 """For a recording whose commands change between its rows."""
 
+EVERY_SENT = (
+    "Log every command that is sent, as PX4 does with SDLOG_PROFILE 17 (high rate). Where a log keeps only some of them, "
+    "they act before they were logged, as here, and what was sent between them is unknown."
+)
+"""For a recording whose commands act before their own stamps."""
+
 MIN_LOG_ODDS = 0.0  # Log odds above which the variable of an unexplained disturbance is named: likelier than not
 
 SURE_LOG_ODDS = 4.0  # Log odds above which the disturbance is said to depend on it

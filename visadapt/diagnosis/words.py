@@ -36,6 +36,12 @@ BETWEEN_ROWS = (
 )
 """What it warns of where the controller is faster than the rows."""
 
+THINNED = (
+    "a log that keeps only some of the commands that were sent makes them late by half of what is between them; if "
+    "this one does, sizes are not exact"
+)
+"""What it warns of where commands that have stamps of their own act before these."""
+
 OPPOSITE = " has the opposite sign of the source's"
 """What a diagnosis warns of, after the quantity's name, where it inverted a sign of the recording."""
 

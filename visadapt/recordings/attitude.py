@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import product
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -45,9 +47,16 @@ def check_attitude(raw: RawEpisode, system: System) -> None:
             f"{raw.origin}: the attitude turns against the body rates; a quaternion that rotates body into world axes "
             "is right"
         )
-    if fit < OTHER_CORRELATION and _turning(raw, np.roll(attitude, 1, axis=1), rates)[0] > TURNS_CORRELATION:
+    ordered = np.roll(attitude, 1, axis=1)
+    if fit < OTHER_CORRELATION and _turning(raw, ordered, rates)[0] > TURNS_CORRELATION:
         raise MisreadError(
             f"{raw.origin}: the attitude's numbers are in the order x, y, z, w; {first}, the scalar, first is right"
+        )
+    signs = [(1, *others) for others in product((1, -1), repeat=3)]
+    if fit < OTHER_CORRELATION and max(_turning(raw, ordered * each, rates)[0] for each in signs) > TURNS_CORRELATION:
+        raise MisreadError(
+            f"{raw.origin}: the attitude's numbers are in another order than w, x, y, z; {first}, the scalar, first is "
+            "right"
         )
 
 

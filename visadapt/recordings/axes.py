@@ -10,7 +10,16 @@ import numpy as np
 
 from visadapt.recordings.clock import RawEpisode
 from visadapt.recordings.episode import MisreadError
-from visadapt.recordings.physics import EXPLAINED_ERROR, TURNS, Columns, agreements, can_decide, with_opposite
+from visadapt.recordings.physics import (
+    EXPLAINED_ERROR,
+    TURNS,
+    Columns,
+    agreements,
+    can_decide,
+    judged_episodes,
+    missed,
+    with_opposite,
+)
 from visadapt.systems import RigidBody, System
 
 TO_RIGHT = ("y", "y_dot", "q_y", "q_z", "omega_y", "omega_z")
@@ -28,6 +37,10 @@ QUARTER = {"x": "y", "x_dot": "y_dot", "y": "x", "y_dot": "x_dot"}
 OTHER_ERROR_RATIO = 2.0
 """How many times as large as in other axes, or with other signs, the error of predicted accelerations must be in those
 of the recording, where the others explain them."""
+
+AS_IT_IS, GAIN, GAINS = 10.0, 3.0, np.linspace(0.5, 1.5, 21)
+"""How many times as large, where a command is in truth recorded from 0 to 1, the mean square of the accelerations
+missed along an axis must be with the command as it is, and with the best of these gains of its actuator."""
 
 
 def check_axes(episodes: Sequence[RawEpisode], system: System) -> None:
@@ -51,11 +64,39 @@ def check_axes(episodes: Sequence[RawEpisode], system: System) -> None:
         raise MisreadError(
             f"{origin}: it moves as if {wrong}; forward, left and up are right: {right} (--columns NAME=COLUMN*-1,...)"
         )
+    if share := _shares(episodes, system):
+        raise MisreadError(
+            f"{origin}: {share} is never negative, and it moves as if {share} went from 0 to 1; from -1 to 1 is right "
+            f"(--columns {share}=COLUMN*2-1)"
+        )
     if opposite := _opposite_commands(episodes, system):
         raise MisreadError(
             f"{origin}: it turns as if {' and '.join(opposite)} had the other sign "
             f"(--columns {','.join(f'{name}=COLUMN*-1' for name in opposite)})"
         )
+
+
+def _shares(episodes: Sequence[RawEpisode], system: System) -> str | None:
+    """A command in the range [-1, 1] that is recorded from 0 to 1, as a throttle often is: it is never negative, and
+    the source explains how the vehicle moves along an axis far better so than with a weaker or a stronger actuator."""
+    judged = judged_episodes(episodes, system)
+    for column, action in enumerate(system.actions):
+        if (action.low, action.high) != (-1, 1) or min(raw.action[:, column].min() for raw in judged) < 0:
+            continue
+        # From 0 to 1 first, then from -1 to 1 as it is, then with each gain.
+        scales = [(2.0, -1.0), (1.0, 0.0), *((gain, gain - 1) for gain in GAINS)]
+        errors = np.array([missed(_scaled(judged, column, *each), system, "xyz") for each in scales])
+        as_share, as_it_is, with_gain = errors[0], errors[1], errors[2:].min(0)
+        if ((as_it_is > AS_IT_IS * as_share) & (with_gain > GAIN * as_share)).any():
+            return action.name
+    return None
+
+
+def _scaled(episodes: Sequence[RawEpisode], column: int, factor: float, offset: float) -> list[RawEpisode]:
+    """The episodes with a command times a factor, plus an offset."""
+    scale, shift = np.ones(episodes[0].action.shape[1]), np.zeros(episodes[0].action.shape[1])
+    scale[column], shift[column] = factor, offset
+    return [replace(raw, action=scale * raw.action + shift) for raw in episodes]
 
 
 def _opposite_commands(

@@ -141,7 +141,7 @@ def _only_angle(episodes: Sequence[RawEpisode], system: System) -> str | None:
 
 def can_decide(episodes: Sequence[RawEpisode], system: System, names: Sequence[str]) -> bool:
     """Whether episodes are long enough, their commands change, and all states are known, to judge these variables."""
-    judged = _judged(episodes, system)
+    judged = judged_episodes(episodes, system)
     duration = sum(float(raw.time[:MOST_ROWS][-1] - raw.time[0]) for raw in judged)
     measured = episodes[0].measured
     known = {*measured, *(system.rate_of(name) for name in measured)}
@@ -153,7 +153,7 @@ def can_decide(episodes: Sequence[RawEpisode], system: System, names: Sequence[s
     )
 
 
-def _judged(episodes: Sequence[RawEpisode], system: System) -> list[RawEpisode]:
+def judged_episodes(episodes: Sequence[RawEpisode], system: System) -> list[RawEpisode]:
     """The episodes that are long enough for second differences after the longest delay."""
     latest = LONGEST_DELAY * system.prediction_time
     return [raw for raw in episodes if len(raw.time) > 2 * rows_apart(raw, system) + 1 + round(latest / period_of(raw))]
@@ -191,12 +191,20 @@ def agreements(
     act late.
     """
     each = []
-    for raw in _judged(episodes, system):
+    for raw in judged_episodes(episodes, system):
         columns = changed({name: values[:MOST_ROWS] for name, values in raw.states.items()})
         each.append(_accelerations(raw, columns, system, delay))
     return {
         name: _agreement(*(np.concatenate([one[name][k] for one in each], axis=-1) for k in (0, 1))) for name in each[0]
     }
+
+
+def missed(episodes: Sequence[RawEpisode], system: System, names: Sequence[str]) -> list[float]:
+    """For each of some variables, the mean square of what the source's accelerations miss of the measured ones, offsets
+    included; of those by rates, where these are measured."""
+    each = [_accelerations(raw, {n: v[:MOST_ROWS] for n, v in raw.states.items()}, system, 0.0) for raw in episodes]
+    off = {name: np.concatenate([one[name][0][-1] - one[name][1] for one in each]) for name in names}
+    return [float(np.square(off[name]).mean()) for name in names]
 
 
 def _accelerations(

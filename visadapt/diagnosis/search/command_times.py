@@ -14,7 +14,7 @@ from torch import Tensor
 from visadapt.diagnosis.search import sign_conventions
 from visadapt.diagnosis.search.draft import LEAST_READ, Draft, Readings, with_unmeasured_in_both
 from visadapt.diagnosis.search.search import Search
-from visadapt.diagnosis.words import A_ROW_LATE, BETWEEN_ROWS, OWN_CLOCK, PART_LATE, number
+from visadapt.diagnosis.words import A_ROW_LATE, BETWEEN_ROWS, OWN_CLOCK, PART_LATE, THINNED, number
 from visadapt.effects import Effect
 from visadapt.estimation.segments import Segments
 from visadapt.recordings.command_clock import instants, sent_by_clock
@@ -27,6 +27,9 @@ MIN_PART = 0.02  # Share of a row by which commands must act early to be moved
 MOST_BESIDE_LATE = 2
 """Most effects that are fitted beside the lateness of commands that have stamps of their own, which often are late.
 None are fitted beside that of others, which is rare."""
+
+EARLIER = (0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
+"""Rows by which commands that have stamps are moved earlier, one after the other, until the source explains less."""
 
 PARTS = (0.2, 0.1, 0.35, 0.5)
 """Parts of a row for which a controller that is faster than the rows may hold each command. The others are tried only
@@ -60,17 +63,44 @@ def with_commands_that_act(draft: Draft, catalogue: Sequence[type[Effect]]) -> D
         a_row.search, given.search, EARLIER_LOG_ODDS, a_row.search.fit_delays
     ):
         return a_row.told(f"each command is recorded a row late, beside the readings that it led to: {A_ROW_LATE}")
-    late = draft.rows.period - a_row.delay(MOST_BESIDE_LATE if stamped else 0)
+    period = draft.rows.period
+    late = period - a_row.delay(MOST_BESIDE_LATE if stamped else 0)
     likelier = given
-    if late > MIN_PART * draft.rows.period:
-        earlier = _Moved.of(draft, catalogue, partial(_earlier, by=late))
-        if sign_conventions.stays_ahead(earlier.search, given.search, EARLIER_LOG_ODDS):
-            likelier = earlier
+    if late > MIN_PART * period:
+        ways = [(late, _Moved.of(draft, catalogue, partial(_earlier, by=late)))]
+        ways += [_likeliest(draft, catalogue, given)] if stamped else []
+        for by, earlier in ways:
+            ahead = sign_conventions.stays_ahead(earlier.search, given.search, EARLIER_LOG_ODDS)
+            if ahead and earlier.best_likelihood > likelier.best_likelihood:
+                late, likelier = by, earlier
     if not stamped and (faster := _faster_than_rows(draft, catalogue, likelier)) is not None:
         return faster
     if likelier is not given:
-        return likelier.told(f"the commands act {number(late, 2)} s before the rows that they are in: {PART_LATE}")
+        moved = f"the commands act {number(late, 2)} s before the rows that they are in: {PART_LATE}"
+        return likelier.told(moved, *([THINNED] if stamped else []))
     return replace(draft, source=given.search.source.fits)
+
+
+def _likeliest(draft: Draft, catalogue: Sequence[type[Effect]], given: _Moved) -> tuple[float, _Moved]:
+    """The s, up to a row, by which commands are late under the source alone, and the draft with them moved."""
+
+    def moved(share: float) -> _Moved:
+        return _Moved.of(draft, catalogue, partial(_earlier, by=share * draft.rows.period))
+
+    tried = [(0.0, given)]
+    for share in EARLIER:
+        tried.append((share, moved(share)))
+        if tried[-1][1].source_likelihood < tried[-2][1].source_likelihood:
+            break
+    if len(tried) > 2:
+        # The top of the parabola through the last three, the middle one of which is the best, or the last of all.
+        shares, likelihoods = np.array([(share, one.source_likelihood) for share, one in tried[-3:]]).T
+        curvature, slope, _ = np.polyfit(shares, likelihoods, 2)
+        if curvature < 0:
+            top = float(np.clip(-slope / (2 * curvature), shares[0], shares[2]))
+            tried.append((top, moved(top)))
+    share, best = max(tried, key=lambda each: each[1].source_likelihood)
+    return share * draft.rows.period, best
 
 
 def _faster_than_rows(draft: Draft, catalogue: Sequence[type[Effect]], slower: _Moved) -> Draft | None:
@@ -130,6 +160,11 @@ class _Moved:
         """Log likelihood of the source's fit."""
         return float(self.search.source.fits.likelihood[0])
 
+    @property
+    def best_likelihood(self) -> float:
+        """Log likelihood of the best set fitted so far."""
+        return float(self.search.best.fits.likelihood[0])
+
     def delay(self, beside: int) -> float:
         """The machine's delay, in s, that fits best, with up to so many other effects `beside` it; a row, where no
         delay is among the effects searched."""
@@ -144,14 +179,14 @@ class _Moved:
             best = max((best, *grown), key=lambda one: one.log_odds)
         return float(best.by_effect(best.fits.theta[0])[delay])
 
-    def told(self, warning: str) -> Draft:
-        """The draft with its commands moved, and a warning of it."""
+    def told(self, *warnings: str) -> Draft:
+        """The draft with its commands moved, and warnings of it."""
         assert self.move is not None
         readings = self.draft.readings
         episodes = zip(readings.commands, readings.stamps, readings.states, strict=True)
         commands = [self.move(command, stamps, states) for command, stamps, states in episodes]
         moved = replace(self.draft, readings=replace(readings, commands=commands))
-        return moved.changed(self.rows, self.raw, warning)
+        return moved.changed(self.rows, self.raw, *warnings)
 
 
 def _a_row_earlier(command: Tensor, stamps: Tensor, states: Tensor) -> Tensor:
