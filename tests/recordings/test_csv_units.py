@@ -1,4 +1,5 @@
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -162,6 +163,10 @@ class TestUnits:
         [
             (lambda s: s * ([1] * 6 + [1.3] * 4 + [1] * 3), "quaternion's length is 1.3"),
             (lambda s: s[:, [0, 1, 2, 3, 4, 5, 7, 8, 9, 6, 10, 11, 12]], "in the order x, y, z, w; q_w, the scalar"),
+            (
+                lambda s: s[:, [*range(6), 9, 6, 7, 8, *range(10, 13)]] * [*[1] * 6, -1, 1, -1, *[1] * 4],
+                "in another order than w, x, y, z; q_w, the scalar",
+            ),
             (lambda s: s * ([1] * 7 + [-1] * 3 + [1] * 3), "rotates body into world axes is right"),
             (lambda s: s * ([1] * 10 + [180 / np.pi] * 3), "rad/s are right"),
             (lambda s: s * [1, 1, -1, 1, 1, -1, *[1] * 7], "column 'z' accelerates against the thrust"),
@@ -187,6 +192,21 @@ class TestUnits:
         load_recording(written(episode.state), Quadrotor())
         with pytest.raises(RecordingError, match=said):
             load_recording(written(change(episode.state)), Quadrotor())
+
+    @pytest.mark.parametrize(("least", "most"), [(0.0, 20.0), (7.0, 14.0)])
+    def test_a_thrust_from_0_to_1_is_not_taken_for_a_weak_motor(self, file, least, most):
+        # Commands from 0 to 1 give 0 to 20 m/s2, or, as half the range of a motor of 0.7 times the thrust, 7 to 14.
+        system = Quadrotor(min_thrust=0.0, max_thrust=20.0)
+        recorded = a_flight(replace(system, min_thrust=least, max_thrust=most), rows=60, episodes=1)
+        (episode,) = recorded.episodes
+        action = episode.action * [0.5, 1, 1, 1] + [0.5, 0, 0, 0]
+        names = (*recorded.measured, *(action.name for action in Quadrotor.actions))
+        path = write(file, dict(zip(("time", *names), (episode.time, *episode.state.T, *action.T), strict=True)))
+        if least > 0:
+            load_recording(path, system)
+            return
+        with pytest.raises(RecordingError, match=r"thrust is never negative, .* \(--columns thrust=COLUMN\*2-1\)"):
+            load_recording(path, system)
 
     @pytest.mark.parametrize(
         ("system", "opposite"),

@@ -57,8 +57,8 @@ EVERY_COMMAND = (
 """For a recording whose commands change between its rows."""
 
 EVERY_SENT = (
-    "Log every command that is sent, as PX4 does with SDLOG_PROFILE 17 (high rate). Where a log keeps only some of them, "
-    "they act before they were logged, as here, and what was sent between them is unknown."
+    "Log every command that is sent, as PX4 does with SDLOG_PROFILE 17 (high rate). Where a log keeps only some of "
+    "them, they act before they were logged, as here, and what was sent between them is unknown."
 )
 """For a recording whose commands act before their own stamps."""
 
