@@ -33,6 +33,7 @@ from .targets.base import Observation as Observation, Target as Target, TaskTarg
 from .targets.env_map import Entry as Entry, EnvMap as EnvMap
 from .targets.following import FollowingTarget as FollowingTarget
 from .targets.gymnasium import GymnasiumTarget as GymnasiumTarget
+from .targets.reaching import ReachingTarget as ReachingTarget
 from .targets.regulation import RegulationTarget as RegulationTarget
 from .targets.rollout import run as run
 from .targets.synthetic import (

@@ -71,7 +71,7 @@ def test_the_command_line_gives_references_to_a_target_without_a_goal(tmp_path, 
     (tmp_path / "course.csv").write_text("\n".join((header, *lines)) + "\n")
     (tmp_path / "bare_quadrotor.py").write_text("from tests.targets.test_following import Machine as make\n")
     flown = ("--policy", va.shipped("quadrotor"), "--target", "bare_quadrotor:make")
-    assert "the target has none: give it references" in refused(capsys, "score", *flown)
+    assert "the target has none: give a quadrotor references" in refused(capsys, "score", *flown)
     course = ("--references", "course.csv")
     assert command("score", *flown, *course, "--episodes", 1) == 0
     assert "1 of 1 stayed near" in capsys.readouterr().out

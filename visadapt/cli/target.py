@@ -16,11 +16,11 @@ import torch
 from visadapt.cli.errors import InputError
 from visadapt.cli.user_code import as_input_error, describe, find_factory, own_code
 from visadapt.policies import Policy
-from visadapt.policies.flight import FollowPolicy
+from visadapt.policies.flight import FollowPolicy, ReachPolicy
 from visadapt.setups.policy_file import load_policy, load_source
 from visadapt.systems import System
 from visadapt.systems.base import parameters
-from visadapt.targets import FollowingTarget, Target, TaskTarget
+from visadapt.targets import FollowingTarget, ReachingTarget, Target, TaskTarget
 from visadapt.targets.base import periods_differ
 from visadapt.targets.env_map import EnvMap
 from visadapt.targets.gymnasium import GymnasiumTarget
@@ -42,6 +42,8 @@ def load_policy_and_target(options: argparse.Namespace) -> tuple[Policy, World, 
     if references is not None and isinstance(policy, FollowPolicy) and not _has_goal(target):
         with as_input_error():
             target = FollowingTarget(target, references)
+    if isinstance(policy, ReachPolicy) and not _has_goal(target):
+        target = ReachingTarget(target)
     _check(options.policy, policy, source, target)
     return policy, source, target
 

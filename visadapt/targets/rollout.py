@@ -42,7 +42,10 @@ def see_within_a_turn(observation: Observation) -> Tensor:
 def see_goals(observation: Observation) -> Tensor:
     """States and, after them, goals (B, n_state + n_goal)."""
     if observation.goal is None:
-        raise TargetError("the policy is shown its goal, but the target has none: give it references, by --references")
+        raise TargetError(
+            "the policy is shown its goal, but the target has none: give a quadrotor references, by --references, a "
+            "fixed wing points (va.ReachingTarget)"
+        )
     return torch.cat((observation.state, observation.goal), 1)
 
 

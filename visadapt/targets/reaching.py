@@ -1,0 +1,37 @@
+"""A fixed wing that knows nothing of a task, through points ahead."""
+
+from __future__ import annotations
+
+from visadapt.targets.base import Target
+from visadapt.targets.goals import GoalTarget
+from visadapt.tasks.reach import Reach
+
+
+class ReachingTarget(GoalTarget):
+    """A target of a fixed wing that shows no goal, whose flights are to pass through points ahead.
+
+    Args:
+        target: its flights start near the origin, in flight along x.
+        task: where the points are; without it, 50 m ahead.
+
+    Raises:
+        TargetError: `reset` starts more than a metre from the origin.
+
+    >>> import torch, visadapt as va
+    >>> class Rig(va.Target):
+    ...     name, period, n_action, system = "my rig", 0.05, 4, va.FixedWing
+    ...     def reset(self, batch, generator):
+    ...         flying = torch.eye(13)[6] + 11.5 * torch.eye(13)[3]
+    ...         return va.Observation(flying.expand(batch, 13), torch.ones(batch, dtype=torch.bool))
+    ...     def step(self, action):
+    ...         return self.reset(len(action), None)
+    >>> target = va.ReachingTarget(Rig())
+    >>> target.reset(2, torch.Generator().manual_seed(0)).goal.shape
+    torch.Size([2, 3])
+    """
+
+    start = "the origin"
+    right = "positions from where a flight starts are right"
+
+    def __init__(self, target: Target, task: Reach | None = None) -> None:
+        super().__init__(target, task or Reach(target.period))
