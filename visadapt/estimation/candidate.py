@@ -39,9 +39,13 @@ quick fits, and for reported results."""
 
 SHORT_PERIOD = 0.005
 """s: up to it the midpoint rule is accurate enough for what is not reported, and takes half as long, unless the system
-is stiff."""
+is stiff. In the screening it is so in all steps that follow the rows' motion."""
 
 MIDPOINT_SHARE = 0.1  # Longest step of the midpoint rule, over that of Runge-Kutta
+
+SCREENED_STEPS = 4.0
+"""Length of the screening's steps, over the longest in which Runge-Kutta follows the rows' motion, where no command is
+late: it compares steps that err alike."""
 
 STEPS_WHERE_LATE = 4
 """Steps in a row, for what is reported, where motors follow their commands late: what acts changes within the row, and
@@ -83,19 +87,17 @@ class CandidateModel:
         if accuracy == FINE:
             smooth_step = min(smooth_step, self.profile.fine_step)
         late = any(follows_late(effect, system) for effect in effects)
-        # Several steps a row, as a fast motion asks for, add little to the screening but where a command is late.
-        if accuracy > COARSEST or late:
-            smooth_step = min(smooth_step, rows.longest_step)
-        step = smooth_step
+        steps = SCREENED_STEPS if accuracy == COARSEST and not late else 1.0
+        step = smooth_step = min(smooth_step, steps * rows.longest_step)
         if any(effect.abrupt for effect in effects):
             step = min(smooth_step, self.profile.longest_abrupt_steps[accuracy])
         if accuracy == FINE and late:
             step = min(step, rows.period / STEPS_WHERE_LATE)
         longest = float(rows.held.max())
-        # The screening compares steps that err alike: the midpoint rule does for longer ones there.
-        screened = accuracy == COARSEST
-        taken = longest / steps_within(longest, step) if screened else rows.period
-        most = rows.longest_step if screened else SHORT_PERIOD
+        if accuracy == COARSEST:
+            taken, most = longest / steps_within(longest, step), rows.longest_step
+        else:
+            taken, most = rows.period, SHORT_PERIOD
         short = taken <= min(most, MIDPOINT_SHARE * longest_step(system))
         integrator = "midpoint" if accuracy < FINE and short else "rk4"
         placeholders = [effect(**{parameter.name: 0.0 for parameter in effect.table}) for effect in effects]

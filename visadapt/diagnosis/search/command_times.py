@@ -29,7 +29,7 @@ MOST_BESIDE_LATE = 2
 None are fitted beside that of others, which is rare."""
 
 EARLIER = (0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
-"""Rows by which commands that have stamps are moved earlier, one after the other, until the source explains less."""
+"""Shares of a row by which commands that have stamps are moved earlier, in turn, until the source explains less."""
 
 PARTS = (0.2, 0.1, 0.35, 0.5)
 """Parts of a row for which a controller that is faster than the rows may hold each command. The others are tried only
