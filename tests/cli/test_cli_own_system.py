@@ -46,7 +46,7 @@ def test_the_tutorial_as_a_user_runs_it(rig, capsys, monkeypatch):
     del sys.modules["furuta"]
     assert cli.main(["check", "furuta.py:Furuta"]) == 0
     said = capsys.readouterr().out
-    assert "furuta is right; 46 effects act on it" in said
+    assert "furuta is right; 50 effects act on it" in said
     assert "changes no rate" not in said
     assert cli.main(["effects", "--system", "furuta.py"]) == 0
     assert "hinge.coulomb_friction (dynamics)" in capsys.readouterr().out

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+import torch
 
 from tests.diagnosed import record
 from visadapt.diagnosis import diagnose
@@ -11,7 +12,7 @@ from visadapt.diagnosis.next_experiment import AS_IT_CHANGES, OF_ONE_MACHINE
 from visadapt.diagnosis.words import CHANGES, CHANGES_BETWEEN
 from visadapt.effects import ActuatorGain, CoulombFriction, PoleLength, ViscousFriction
 from visadapt.effects.forces import CartForce
-from visadapt.recordings import Recording
+from visadapt.recordings import Episode, Recording
 from visadapt.systems import CartPole
 from visadapt.world import World
 
@@ -46,6 +47,28 @@ def test_its_size_is_said_from_stretch_to_stretch(effect, parameter, values):
     assert (found.verdict, found.next_experiment) == ("unexplained", AS_IT_CHANGES)
     np.testing.assert_allclose(sizes(found.warnings, effect.name.replace("_", " ")), values, rtol=0.1)
     assert str(found).startswith("unexplained: The size of an effect changes within the recording")
+
+
+def test_what_changes_within_a_recording_is_no_push():
+    # A bearing that sticks from half of a run on, which looks like a push beyond the source.
+    generator, period, rows = torch.Generator().manual_seed(0), 0.03, 500
+    before, after = (World(CartPole(), [ViscousFriction(coefficient=size).double()], period) for size in (0.0, 4.0))
+    gains = torch.tensor([0.3, 0.4, 3.0, 0.6], dtype=torch.float64)
+    at, states, actions = before.start(torch.tensor([[0.0, 0.0, 0.05, 0.0]], dtype=torch.float64)), [], []
+    with torch.no_grad():
+        for row in range(rows):
+            aim = 0.15 * np.sin(0.09 * row) + 0.05 * np.sin(0.37 * row)
+            action = ((at.state * gains).sum(1, keepdim=True) + aim).clamp(-1, 1)
+            states.append(at.state[0])
+            actions.append(action[0])
+            at = (after if row >= rows // 2 else before).step(at, action)
+    clean = torch.stack(states)
+    state = (clean + 1e-3 * torch.randn(clean.shape, generator=generator, dtype=torch.float64)).numpy()
+    episode = Episode(period * np.arange(rows), torch.stack(actions).numpy(), state)
+    measured = tuple(variable.name for variable in CartPole.states)
+    found = diagnose(Recording((episode,), measured, period, ("run.csv",)), World(CartPole()), CATALOGUE)
+    assert sizes(found.warnings, "viscous friction")[::4] == pytest.approx([0.0, 4.0], abs=0.1)
+    assert found.where.pushes == ()
 
 
 class Ridges(CartForce):

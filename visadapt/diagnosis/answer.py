@@ -63,7 +63,8 @@ def answer(
     A push acts in one episode alone, as no effect does: while it is among the rows, the most probable set is one that
     imitates it. So where a recording is unexplained, the rows within pushes are left out, and the others are explained,
     unless all is explained in each of several recordings by itself: then it is the machine that was changed.
-    If these have no gap, the recording stays unexplained, with what passes in `pushes`.
+    If these have no gap, the recording stays unexplained, with what passes in `pushes`. If that does not explain it, but
+    an effect whose size changes does, there are no pushes.
 
     Args:
         world: the source.
@@ -88,7 +89,8 @@ def answer(
             break
         latest = _answer(beside(aside), finder, aside, jobs, progress)
     if latest.verdict == UNEXPLAINED or not latest.pushes:
-        return first
+        # Beyond the source, an effect whose size changes may look like a push wherever it is large.
+        return replace(first, pushes=()) if first.explored.changes else first
     # Beside what passes there is no gap, but what passes may be no push: an effect that acts in a few rows alone.
     return replace(latest, verdict=UNEXPLAINED) if latest.no_gap_beside_pushes else latest
 
