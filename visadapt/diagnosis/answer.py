@@ -63,8 +63,8 @@ def answer(
     A push acts in one episode alone, as no effect does: while it is among the rows, the most probable set is one that
     imitates it. So where a recording is unexplained, the rows within pushes are left out, and the others are explained,
     unless all is explained in each of several recordings by itself: then it is the machine that was changed.
-    If these have no gap, the recording stays unexplained, with what passes in `pushes`. If that does not explain it, but
-    an effect whose size changes does, there are no pushes.
+    If these have no gap, the recording stays unexplained, with what passes in `pushes`; if they stay unexplained, but
+    an effect whose size changes explains all rows, there are no pushes.
 
     Args:
         world: the source.
