@@ -1,3 +1,5 @@
+import json
+
 import pytest
 import torch
 
@@ -64,6 +66,19 @@ def test_a_quadrotor_follows_references(here, capsys):
 def test_an_effect_beyond_what_a_diagnosis_looks_for_is_said_so(here, capsys):
     assert run(*TINY, "--effect", "viscous_friction:coefficient=-5") == 0
     assert "coefficient is -5 N s/m; a diagnosis looks for it from 0 to 30 N s/m" in capsys.readouterr().err
+
+
+def test_of_an_ambiguous_diagnosis_it_is_said_which_effects_the_simulator_has(here, diagnosis, capsys):
+    names = ["constant_force", "actuator_bias"]
+    path = diagnosis([(names[0], {"force": 1.0}), (names[1], {"offset": 0.03})], "ambiguous")
+    content = json.loads(path.read_text())
+    for cause, other in zip(content["causes"], reversed(names), strict=True):
+        cause["indistinguishable_from"] = [other]
+    path.write_text(json.dumps(content))
+    assert run(*TINY, "--diagnosis", path) == 0
+    (taken,) = (str(effect.name).replace("_", " ") for effect in va.load_source("p.safetensors").effects)
+    said = capsys.readouterr().err
+    assert f"diagnosis.json: ambiguous: the simulator has {taken}, not " in said
 
 
 @pytest.mark.parametrize("iterations", [1, 10])

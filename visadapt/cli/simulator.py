@@ -5,12 +5,13 @@ from __future__ import annotations
 import argparse
 import difflib
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
 
 from visadapt.cli.errors import InputError
-from visadapt.diagnosis.saved import load_effects
+from visadapt.diagnosis.saved import load_explanations
 from visadapt.diagnosis.words import printable, with_unit
 from visadapt.effects import EFFECTS, Effect
 from visadapt.effects.base import require_system
@@ -46,7 +47,13 @@ def given_effects(options: argparse.Namespace, system: System) -> list[Effect]:
     catalogue(system)  # makes the effects of a system of one's own known, by which they are named
     effects: list[Effect] = []
     if options.diagnosis:
-        effects = load_effects(options.diagnosis, system)
+        effects, *others = load_explanations(options.diagnosis, system)
+        if others:
+            print(
+                f"visadapt: {options.diagnosis}: ambiguous: the simulator has {_names(effects)}, not "
+                f"{' or '.join(_names(each) for each in others)} (--effect gives others)",
+                file=sys.stderr,
+            )
         for warning in read_json(Path(options.diagnosis)).get("warnings") or ():
             print(f"visadapt: {options.diagnosis}: {printable(str(warning))}", file=sys.stderr)
     given = [_effect(text, system) for text in options.effect]
@@ -54,6 +61,10 @@ def given_effects(options: argparse.Namespace, system: System) -> list[Effect]:
     if twice := [name for name in names if names.count(name) > 1]:
         raise InputError(f"--effect: {twice[0]} is given more than once")
     return [effect for effect in effects if effect.name not in names] + given
+
+
+def _names(effects: Sequence[Effect]) -> str:
+    return " and ".join(effect.name.replace("_", " ") for effect in effects)
 
 
 def _effect(text: str, system: System) -> Effect:
