@@ -189,5 +189,5 @@ def test_what_a_policy_is_shown_of_a_target_is_its_state_and_then_its_goal():
     shown = see_goals(seen)
     assert torch.equal(shown[:, :13], seen.state)
     assert torch.equal(shown[:, 13:], seen.goal)
-    with pytest.raises(TargetError, match="the target has none: give it references"):
+    with pytest.raises(TargetError, match="the target has none: give a quadrotor references"):
         see_goals(SyntheticTarget().reset(1, seeded()))
