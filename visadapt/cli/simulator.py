@@ -51,7 +51,7 @@ def given_effects(options: argparse.Namespace, system: System) -> list[Effect]:
         if others:
             print(
                 f"visadapt: {options.diagnosis}: ambiguous: the simulator has {_names(effects)}, not "
-                f"{' or '.join(_names(each) for each in others)} (--effect gives others)",
+                f"{' or '.join(_names(each) for each in others)} (for others, give --effect without --diagnosis)",
                 file=sys.stderr,
             )
         for warning in read_json(Path(options.diagnosis)).get("warnings") or ():

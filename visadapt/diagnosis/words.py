@@ -37,8 +37,8 @@ BETWEEN_ROWS = (
 """What it warns of where the controller is faster than the rows."""
 
 THINNED = (
-    "a log that keeps only some of the commands that were sent makes them late by half of what is between them; if "
-    "this one does, sizes are not exact"
+    "a log that keeps only some of the commands that were sent makes them late by half the time between those that it "
+    "keeps; if this one does, sizes are not exact"
 )
 """What it warns of where commands that have stamps of their own act before these."""
 

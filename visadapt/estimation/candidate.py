@@ -39,13 +39,13 @@ quick fits, and for reported results."""
 
 SHORT_PERIOD = 0.005
 """s: up to it the midpoint rule is accurate enough for what is not reported, and takes half as long, unless the system
-is stiff. In the screening it is so in all steps that follow the rows' motion."""
+is stiff. The screening uses it in every step that is short enough for the rows' motion."""
 
 MIDPOINT_SHARE = 0.1  # Longest step of the midpoint rule, over that of Runge-Kutta
 
 SCREENED_STEPS = 4.0
 """Length of the screening's steps, over the longest in which Runge-Kutta follows the rows' motion, where no command is
-late: it compares steps that err alike."""
+late: with an effect and without it, steps of the same length err alike."""
 
 STEPS_WHERE_LATE = 4
 """Steps in a row, for what is reported, where motors follow their commands late: what acts changes within the row, and

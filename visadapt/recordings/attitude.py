@@ -52,8 +52,11 @@ def check_attitude(raw: RawEpisode, system: System) -> None:
         raise MisreadError(
             f"{raw.origin}: the attitude's numbers are in the order x, y, z, w; {first}, the scalar, first is right"
         )
-    signs = [(1, *others) for others in product((1, -1), repeat=3)]
-    if fit < OTHER_CORRELATION and max(_turning(raw, ordered * each, rates)[0] for each in signs) > TURNS_CORRELATION:
+    signs = [np.array(each) for each in product((1, -1), repeat=3)]
+    if max(_turning(raw, attitude, rates * each)[0] for each in signs) > TURNS_CORRELATION:
+        return  # the order is right, whatever the signs of the rates are
+    others = (_turning(raw, ordered * [1, *each], rates)[0] for each in signs)
+    if fit < OTHER_CORRELATION and max(others) > TURNS_CORRELATION:
         raise MisreadError(
             f"{raw.origin}: the attitude's numbers are in another order than w, x, y, z; {first}, the scalar, first is "
             "right"

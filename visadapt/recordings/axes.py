@@ -38,7 +38,7 @@ OTHER_ERROR_RATIO = 2.0
 """How many times as large as in other axes, or with other signs, the error of predicted accelerations must be in those
 of the recording, where the others explain them."""
 
-AS_IT_IS, GAIN, GAINS = 10.0, 3.0, np.linspace(0.5, 1.5, 21)
+AS_IT_IS, GAIN, GAINS = 10.0, 3.0, np.linspace(0.2, 1.5, 27)
 """How many times as large, where a command is in truth recorded from 0 to 1, the mean square of the accelerations
 missed along an axis must be with the command as it is, and with the best of these gains of its actuator."""
 
@@ -64,7 +64,7 @@ def check_axes(episodes: Sequence[RawEpisode], system: System) -> None:
         raise MisreadError(
             f"{origin}: it moves as if {wrong}; forward, left and up are right: {right} (--columns NAME=COLUMN*-1,...)"
         )
-    if share := _shares(episodes, system):
+    if share := _recorded_from_0_to_1(episodes, system):
         raise MisreadError(
             f"{origin}: {share} is never negative, and it moves as if {share} went from 0 to 1; from -1 to 1 is right "
             f"(--columns {share}=COLUMN*2-1)"
@@ -76,7 +76,7 @@ def check_axes(episodes: Sequence[RawEpisode], system: System) -> None:
         )
 
 
-def _shares(episodes: Sequence[RawEpisode], system: System) -> str | None:
+def _recorded_from_0_to_1(episodes: Sequence[RawEpisode], system: System) -> str | None:
     """A command in the range [-1, 1] that is recorded from 0 to 1, as a throttle often is: it is never negative, and
     the source explains how the vehicle moves along an axis far better so than with a weaker or a stronger actuator."""
     judged = judged_episodes(episodes, system)
