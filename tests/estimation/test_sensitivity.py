@@ -1,5 +1,5 @@
 """The response of innovations to effects, against integration in short steps: at short periods, where no effect is
-integrated, and in a fast motion, where the screening takes one step a row."""
+integrated, and in a fast motion, where the screening takes longer steps than a fit."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ ANSWERED_BY_SLOPES = [
     and not effect.repeats_readings
 ]
 PENDULUM = DoublePendulum()
-IN_ONE_STEP = [
+INTEGRATED = [
     effect
     for effect in catalogue(PENDULUM)
     if issubclass(effect, ActuationEffect | DynamicsEffect)
@@ -34,24 +34,32 @@ IN_ONE_STEP = [
 ]
 
 
-@pytest.fixture(scope="module")
-def source():
-    """The source along 400 rows, 4 ms apart, with its fit and what adding effects to it changes."""
-    world, time = World(SYSTEM, period=0.004), 0.004 * np.arange(400)
-    commands = torch.tensor(0.9 * np.sin(9 * time))[:, None]
+def along(world, start, commands, noise):
+    """The source along a motion that `commands` (T, n_action) drive from a state, of which the states with noise are
+    measured, with its fit and what adding effects to it changes."""
+    system, read = world.system, [k for k, deviation in enumerate(noise) if deviation]
     with torch.no_grad():
-        at, states = world.start(torch.tensor([[0.0, 0.0, 0.1, 0.0]], dtype=torch.float64)), []
-        for command in commands:
+        at, states = world.start(torch.tensor([start], dtype=torch.float64)), []
+        for command in torch.tensor(commands):
             states.append(at.state[0])
             at = world.step(at, command[None])
-    generator = torch.Generator().manual_seed(0)
-    measured = torch.stack(states)[:, [0, 2]]
-    measured = measured + 1e-3 * torch.randn(measured.shape, generator=generator, dtype=torch.float64)
-    episode = Episode(time, commands.numpy(), measured.numpy())
-    rows = prepare(Recording((episode,), ("x", "theta"), 0.004, ("swinging",)), SYSTEM).rows
-    assert rows.period <= SHORT_PERIOD
-    fits = Search(SYSTEM, rows, ()).source.fits
-    return rows, fits, Sensitivity.on_every(1, SYSTEM, (), fits, rows)
+    clean, generator = torch.stack(states)[:, read], torch.Generator().manual_seed(0)
+    deviations = torch.tensor(noise, dtype=torch.float64)[read]
+    measured = clean + deviations * torch.randn(clean.shape, generator=generator, dtype=torch.float64)
+    episode = Episode(world.period * np.arange(len(commands)), commands, measured.numpy())
+    names = tuple(system.states[k].name for k in read)
+    rows = prepare(Recording((episode,), names, world.period, ("moving",)), system).rows
+    fits = Search(system, rows, ()).source.fits
+    return rows, fits, Sensitivity.on_every(1, system, (), fits, rows)
+
+
+@pytest.fixture(scope="module")
+def source():
+    """400 rows of a cart-pole, 4 ms apart, whose positions are measured."""
+    commands = 0.9 * np.sin(9 * 0.004 * np.arange(400))[:, None]
+    found = along(World(SYSTEM, period=0.004), [0.0, 0.0, 0.1, 0.0], commands, [1e-3, 0, 1e-3, 0])
+    assert found[0].period <= SHORT_PERIOD
+    return found
 
 
 def off(system, effect, rows, fits, sensitivity):
@@ -78,26 +86,16 @@ def test_the_response_is_that_of_integrated_steps(source, effect):
 
 @pytest.fixture(scope="module")
 def fast():
-    """The source along 300 rows of a double pendulum, 20 ms apart, that turns at up to 15 rad/s."""
-    world, time = World(PENDULUM, period=0.02, substeps=20), 0.02 * np.arange(300)
-    commands = torch.tensor(np.column_stack([0.5 * np.sin(2.1 * time), 0.3 * np.sin(3.7 * time)]))
-    with torch.no_grad():
-        at, states = world.start(torch.tensor([[1.5, 1.0, 0.0, 0.0]], dtype=torch.float64)), []
-        for command in commands:
-            states.append(at.state[0])
-            at = world.step(at, command[None])
-    generator = torch.Generator().manual_seed(0)
-    measured = torch.stack(states)
-    noise = torch.tensor([1e-3, 1e-3, 2e-2, 2e-2]) * torch.randn(measured.shape, generator=generator)
-    episode = Episode(time, commands.numpy(), (measured + noise).numpy())
-    names = tuple(variable.name for variable in PENDULUM.states)
-    rows = prepare(Recording((episode,), names, 0.02, ("fast",)), PENDULUM).rows
-    assert rows.longest_step < rows.period
-    fits = Search(PENDULUM, rows, ()).source.fits
-    return rows, fits, Sensitivity.on_every(1, PENDULUM, (), fits, rows)
+    """300 rows of a double pendulum, 20 ms apart, that turns at up to 15 rad/s."""
+    time = 0.02 * np.arange(300)
+    commands = np.column_stack([0.5 * np.sin(2.1 * time), 0.3 * np.sin(3.7 * time)])
+    world = World(PENDULUM, period=0.02, substeps=20)
+    found = along(world, [1.5, 1.0, 0.0, 0.0], commands, [1e-3, 1e-3, 2e-2, 2e-2])
+    assert found[0].longest_step < found[0].period
+    return found
 
 
-@pytest.mark.parametrize("effect", IN_ONE_STEP, ids=lambda effect: effect.name)
+@pytest.mark.parametrize("effect", INTEGRATED, ids=lambda effect: effect.name)
 def test_the_response_of_a_fast_motion_is_that_of_short_steps(fast, effect):
     assert off(PENDULUM, effect, *fast) < 0.2
 

@@ -12,7 +12,7 @@ import torch
 
 from visadapt.cli.errors import InputError
 from visadapt.diagnosis.saved import load_explanations
-from visadapt.diagnosis.words import printable, with_unit
+from visadapt.diagnosis.words import listed, printable, with_unit
 from visadapt.effects import EFFECTS, Effect
 from visadapt.effects.base import require_system
 from visadapt.effects.catalogue import catalogue, sized
@@ -64,7 +64,7 @@ def given_effects(options: argparse.Namespace, system: System) -> list[Effect]:
 
 
 def _names(effects: Sequence[Effect]) -> str:
-    return " and ".join(effect.name.replace("_", " ") for effect in effects)
+    return listed([effect.name.replace("_", " ") for effect in effects])
 
 
 def _effect(text: str, system: System) -> Effect:

@@ -47,16 +47,22 @@ def check_attitude(raw: RawEpisode, system: System) -> None:
             f"{raw.origin}: the attitude turns against the body rates; a quaternion that rotates body into world axes "
             "is right"
         )
+    if fit < OTHER_CORRELATION:
+        _check_order(raw, first, attitude, rates)
+
+
+def _check_order(raw: RawEpisode, first: str, attitude: NDArray[np.float64], rates: NDArray[np.float64]) -> None:
+    """Raises MisreadError where a quaternion, which does not turn by the body rates, does so in another order of its
+    numbers; `first` names its scalar."""
     ordered = np.roll(attitude, 1, axis=1)
-    if fit < OTHER_CORRELATION and _turning(raw, ordered, rates)[0] > TURNS_CORRELATION:
+    if _turning(raw, ordered, rates)[0] > TURNS_CORRELATION:
         raise MisreadError(
             f"{raw.origin}: the attitude's numbers are in the order x, y, z, w; {first}, the scalar, first is right"
         )
     signs = [np.array(each) for each in product((1, -1), repeat=3)]
     if max(_turning(raw, attitude, rates * each)[0] for each in signs) > TURNS_CORRELATION:
         return  # the order is right, whatever the signs of the rates are
-    others = (_turning(raw, ordered * [1, *each], rates)[0] for each in signs)
-    if fit < OTHER_CORRELATION and max(others) > TURNS_CORRELATION:
+    if max(_turning(raw, ordered * [1, *each], rates)[0] for each in signs) > TURNS_CORRELATION:
         raise MisreadError(
             f"{raw.origin}: the attitude's numbers are in another order than w, x, y, z; {first}, the scalar, first is "
             "right"

@@ -7,6 +7,7 @@ from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from visadapt.recordings.clock import RawEpisode
 from visadapt.recordings.episode import MisreadError
@@ -21,6 +22,8 @@ from visadapt.recordings.physics import (
     with_opposite,
 )
 from visadapt.systems import RigidBody, System
+
+Floats = NDArray[np.floating]
 
 TO_RIGHT = ("y", "y_dot", "q_y", "q_z", "omega_y", "omega_z")
 """States of opposite sign in axes forward, left and up and axes forward, right and down, but for z."""
@@ -83,20 +86,20 @@ def _recorded_from_0_to_1(episodes: Sequence[RawEpisode], system: System) -> str
     for column, action in enumerate(system.actions):
         if (action.low, action.high) != (-1, 1) or min(raw.action[:, column].min() for raw in judged) < 0:
             continue
+        this = np.arange(len(system.actions)) == column
         # From 0 to 1 first, then from -1 to 1 as it is, then with each gain.
         scales = [(2.0, -1.0), (1.0, 0.0), *((gain, gain - 1) for gain in GAINS)]
-        errors = np.array([missed(_scaled(judged, column, *each), system, "xyz") for each in scales])
+        scaled = (_scaled(judged, np.where(this, factor, 1), this * offset) for factor, offset in scales)
+        errors = np.array([missed(each, system, "xyz") for each in scaled])
         as_share, as_it_is, with_gain = errors[0], errors[1], errors[2:].min(0)
         if ((as_it_is > AS_IT_IS * as_share) & (with_gain > GAIN * as_share)).any():
             return action.name
     return None
 
 
-def _scaled(episodes: Sequence[RawEpisode], column: int, factor: float, offset: float) -> list[RawEpisode]:
-    """The episodes with a command times a factor, plus an offset."""
-    scale, shift = np.ones(episodes[0].action.shape[1]), np.zeros(episodes[0].action.shape[1])
-    scale[column], shift[column] = factor, offset
-    return [replace(raw, action=scale * raw.action + shift) for raw in episodes]
+def _scaled(episodes: Sequence[RawEpisode], factors: Floats, offsets: Floats | float = 0.0) -> list[RawEpisode]:
+    """The episodes with each of their commands times a factor, plus an offset."""
+    return [replace(raw, action=factors * raw.action + offsets) for raw in episodes]
 
 
 def _opposite_commands(
@@ -119,8 +122,7 @@ def _sets(system: System) -> Iterator[tuple[str, ...]]:
 
 def _with_opposite(episodes: Sequence[RawEpisode], system: System, commands: Collection[str]) -> list[RawEpisode]:
     """The episodes with these commands of the opposite sign."""
-    signs = np.array([-1.0 if action.name in commands else 1.0 for action in system.actions])
-    return [replace(raw, action=signs * raw.action) for raw in episodes]
+    return _scaled(episodes, np.array([-1.0 if action.name in commands else 1.0 for action in system.actions]))
 
 
 def _explains(error: float, as_it_is: float) -> bool:

@@ -190,21 +190,35 @@ def agreements(
     `changed` gives the measured states the units and names to be tried; `delay` is by how many s the commands
     act late.
     """
-    each = []
-    for raw in judged_episodes(episodes, system):
-        columns = changed({name: values[:MOST_ROWS] for name, values in raw.states.items()})
-        each.append(_accelerations(raw, columns, system, delay))
-    return {
-        name: _agreement(*(np.concatenate([one[name][k] for one in each], axis=-1) for k in (0, 1))) for name in each[0]
-    }
+    found = _of_all(episodes, system, changed, delay)
+    return {name: _agreement(measured, predicted) for name, (measured, predicted) in found.items()}
 
 
 def missed(episodes: Sequence[RawEpisode], system: System, names: Sequence[str]) -> list[float]:
     """For each of some variables, the mean square of what the source's accelerations miss of the measured ones, offsets
     included; of those by rates, where these are measured."""
-    each = [_accelerations(raw, {n: v[:MOST_ROWS] for n, v in raw.states.items()}, system, 0.0) for raw in episodes]
-    off = {name: np.concatenate([one[name][0][-1] - one[name][1] for one in each]) for name in names}
-    return [float(np.square(off[name]).mean()) for name in names]
+    found = _of_all(episodes, system)
+    return [float(np.square(found[name][0][-1] - found[name][1]).mean()) for name in names]
+
+
+def _of_all(
+    episodes: Sequence[RawEpisode],
+    system: System,
+    changed: Callable[[Columns], Columns] = unchanged,
+    delay: float = 0.0,
+) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """As `_accelerations`, of all episodes that are judged, one after the other."""
+    each = []
+    for raw in judged_episodes(episodes, system):
+        columns = changed({name: values[:MOST_ROWS] for name, values in raw.states.items()})
+        each.append(_accelerations(raw, columns, system, delay))
+    return {
+        name: (
+            np.concatenate([one[name][0] for one in each], axis=-1),
+            np.concatenate([one[name][1] for one in each], axis=-1),
+        )
+        for name in each[0]
+    }
 
 
 def _accelerations(

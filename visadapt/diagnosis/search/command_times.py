@@ -70,8 +70,8 @@ def with_commands_that_act(draft: Draft, catalogue: Sequence[type[Effect]]) -> D
         ways = [(late, _Moved.of(draft, catalogue, partial(_earlier, by=late)))]
         ways += [_likeliest(draft, catalogue, given)] if stamped else []
         for by, earlier in ways:
-            ahead = sign_conventions.stays_ahead(earlier.search, given.search, EARLIER_LOG_ODDS)
-            if ahead and earlier.best_likelihood > likelier.best_likelihood:
+            stays = sign_conventions.stays_ahead(earlier.search, given.search, EARLIER_LOG_ODDS)
+            if stays and sign_conventions.ahead(earlier.search, likelier.search) > 0:
                 late, likelier = by, earlier
     if not stamped and (faster := _faster_than_rows(draft, catalogue, likelier)) is not None:
         return faster
@@ -159,11 +159,6 @@ class _Moved:
     def source_likelihood(self) -> float:
         """Log likelihood of the source's fit."""
         return float(self.search.source.fits.likelihood[0])
-
-    @property
-    def best_likelihood(self) -> float:
-        """Log likelihood of the best set fitted so far."""
-        return float(self.search.best.fits.likelihood[0])
 
     def delay(self, beside: int) -> float:
         """The machine's delay, in s, that fits best, with up to so many other effects `beside` it; a row, where no
