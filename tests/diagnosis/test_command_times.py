@@ -69,9 +69,9 @@ def test_commands_of_the_loop_that_reads_act_from_their_rows_on():
     assert not any(OWN_CLOCK in said for said in prepare(recording, CartPole(), CATALOGUE).warnings)
 
 
-def logged(kept, noise):
+def logged(kept, noise, late=0):
     """6 s of a balanced cart-pole, read every 40 ms, whose commands change every 4 ms; a log keeps one every `kept` ms,
-    and a row has the mean of those that it keeps, each held until the next."""
+    `late` ms after it acts, and a row has the mean of those that it keeps, each held until the next."""
     generator = torch.Generator().manual_seed(0)
     world, row, loop = World(CartPole(), (), STEP), 40, 4
     at, states, held = world.start(torch.tensor([[0.0, 0.0, 0.02, 0.0]], dtype=torch.float64)), [], []
@@ -87,11 +87,12 @@ def logged(kept, noise):
                 states.append(at.state[0, [0, 2]])
             held.append(last[0])
             at = world.step(at, command)
-    commands = torch.stack(held).unflatten(0, (-1, row)).mean(1).numpy()
+    stamped = torch.stack(held[:1] * late + held[: len(held) - late])
+    commands = stamped.unflatten(0, (-1, row)).mean(1).numpy()
     clean = torch.stack(states)
     state = (clean + noise * torch.randn(clean.shape, generator=generator, dtype=torch.float64)).numpy()
     episode = Episode(STEP * row * np.arange(len(state)), commands, state)
-    return Recording((episode,), ("x", "theta"), STEP * row, ("run.ulg",), stamped_commands=True)
+    return Recording((episode,), ("x", "theta"), STEP * row, ("run.ulg",), command_period=STEP * kept)
 
 
 @pytest.mark.parametrize(("kept", "late"), [(40, 0.018), (16, 0.006)])
@@ -103,3 +104,8 @@ def test_commands_of_which_a_log_keeps_some_are_moved_by_half_of_what_is_between
 
 def test_commands_of_which_a_log_keeps_all_act_when_they_were_sent():
     assert prepare(logged(4, 1e-4), CartPole(), CATALOGUE).warnings == ()
+
+
+def test_commands_that_reach_their_log_late_are_not_said_to_be_some_of_those_sent():
+    (said,) = prepare(logged(4, 1e-4, late=5), CartPole(), CATALOGUE).warnings
+    assert float(said.split()[3]) == pytest.approx(0.005, abs=0.001)

@@ -327,7 +327,7 @@ def test_commands_whose_stamps_are_late_by_part_of_a_row_are_moved_by_it(effects
     whole = record([*effects, ActuatorDelay(delay=0.03)])
     late = [np.concatenate((each.action[:1], each.action[:-1])) for each in whole.episodes]
     episodes = [dataclasses.replace(each, action=action) for each, action in zip(whole.episodes, late, strict=True)]
-    recording = dataclasses.replace(whole, episodes=tuple(episodes), stamped_commands=True)
+    recording = dataclasses.replace(whole, episodes=tuple(episodes), command_period=whole.period)
     prepared = prepare(recording, CartPole(), [ActuatorDelay, ViscousFriction, ActuatorGain])
     (said,) = [warning for warning in prepared.warnings if PART_LATE in warning]
     assert float(said.split()[3]) == pytest.approx(0.02, abs=0.003)

@@ -6,7 +6,9 @@ import torch
 
 from tests.own_systems import Pendulum
 from visadapt.diagnosis import diagnose
+from visadapt.diagnosis.search.searched_effects import shown_by
 from visadapt.effects.catalogue import catalogue
+from visadapt.effects.sensing import SensorGain
 from visadapt.recordings import Episode, Recording
 from visadapt.world import World
 
@@ -42,3 +44,16 @@ def test_the_sensor_is_named_and_its_scale_found(hidden, measured):
     found = diagnose(recorded(BY_NAME[hidden](scale=1.1), measured), World(Pendulum(), (), PERIOD))
     assert (found.verdict, [cause.effect for cause in found.causes]) == ("identified", [hidden])
     assert found.causes[0].parameters["scale"].value == pytest.approx(1.1, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("read", "scales"),
+    [
+        ([0, 1], ["angle.sensor_scale", "angle.position_scale", "rate.sensor_scale"]),
+        ([0], ["angle.sensor_scale"]),
+        ([1], ["rate.sensor_scale"]),
+    ],
+)
+def test_a_scale_is_searched_of_sensors_that_were_read(read, scales):
+    shown = shown_by(catalogue(Pendulum()), set(read))
+    assert [effect.name for effect in shown if issubclass(effect, SensorGain)] == scales

@@ -11,17 +11,19 @@ from visadapt.tasks.reach import Reach
 
 
 class Wing(va.Target):
-    """A wing that starts in level flight `away` m to the side of the origin, and shows no goal."""
+    """A wing that starts in level flight `away` m to the side of the origin, and shows no goal but the states that are
+    `shown`; `turned`, it flies against x."""
 
     name, period, n_action, system = "wing", 0.05, 4, va.FixedWing
 
-    def __init__(self, away=0.0):
-        self.known, self.away = va.FlightTarget(Reach(), va.FixedWing()), away
+    def __init__(self, away=0.0, shown=13, turned=False):
+        self.known, self.away, self.shown, self.turned = va.FlightTarget(Reach(), va.FixedWing()), away, shown, turned
 
     def _shown(self, seen):
         state = seen.state.clone()
         state[:, 1] += self.away
-        return va.Observation(state, seen.alive)
+        state[:, 3] *= -1 if self.turned else 1
+        return va.Observation(state[:, : self.shown], seen.alive)
 
     def reset(self, batch, generator):
         return self._shown(self.known.reset(batch, torch.Generator().manual_seed(9)))
@@ -36,9 +38,17 @@ def test_it_is_flown_and_scored_as_a_target_with_the_task():
     assert va.score(policy, given, episodes=2) == va.score(policy, known, episodes=2)
 
 
-def test_a_flight_that_starts_elsewhere_is_refused():
-    with pytest.raises(TargetError, match=r"^wing: starts 3 m from the origin; positions from where a flight starts"):
-        va.ReachingTarget(Wing(away=3.0)).reset(1, seeded())
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"away": 3.0}, "starts 3 m from the origin; positions from where a flight starts are right"),
+        ({"turned": True}, r"starts at \(-11.[0-9]+, .*\) m/s, away from the points ahead, which lie along x"),
+        ({"shown": 2}, "shows 2 states; the 13 of its vehicle are right"),
+    ],
+)
+def test_a_flight_that_starts_elsewhere_or_shows_other_states_is_refused(wrong, said):
+    with pytest.raises(TargetError, match=f"^wing: {said}"):
+        va.ReachingTarget(Wing(**wrong)).reset(1, seeded())
 
 
 def test_the_command_line_gives_points_to_a_target_without_a_goal(tmp_path, monkeypatch, capsys):

@@ -81,8 +81,9 @@ class RawEpisode:
     """(T, H, W), where frames are read in the place of states"""
     usable: NDArray[np.bool_] | None = None
     """(T, n_measured) which readings are measurements; without it, all are"""
-    stamped_commands: bool = False
-    """whether its commands had stamps of their own; a row holds the mean until the next one"""
+    command_period: float | None = None
+    """median s between commands that had stamps of their own, of which a row holds the mean until the next; None of
+    commands without"""
 
     @property
     def origin(self) -> str:

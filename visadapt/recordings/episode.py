@@ -122,8 +122,9 @@ class Recording:
     """(T, n_measured) for each episode, which readings are measurements; without it, all are"""
     resolution: tuple[float, ...] = ()
     """smallest meaningful difference of each measured state; without it, the smallest between two of its readings"""
-    stamped_commands: bool = False
-    """whether the commands had stamps of their own; a row holds the mean until the next one"""
+    command_period: float | None = None
+    """median s between commands that had stamps of their own, of which a row holds the mean until the next; None of
+    commands without"""
 
     def __post_init__(self) -> None:
         if not self.episodes:

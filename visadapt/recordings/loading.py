@@ -129,8 +129,14 @@ def load_recording(
             f"{where[0]}{f' and {len(where) - 1} more' if len(where) > 1 else ''}: {text}"
             for text, where in notes.items()
         ),
-        stamped_commands=all(part.stamped_commands for part in parts),
+        command_period=_command_period(parts),
     )
+
+
+def _command_period(parts: Sequence[RawEpisode]) -> float | None:
+    """The median over the episodes; None where one has commands without stamps of their own."""
+    periods = [part.command_period for part in parts if part.command_period is not None]
+    return float(np.median(periods)) if len(periods) == len(parts) else None
 
 
 def _files(paths: Sequence[str | os.PathLike[str]], note: Note) -> list[Path]:

@@ -93,7 +93,7 @@ def read_log(path: Path, read: Read, system: System, given: Mapping[str, str], n
         {name: ".".join(column) for name, column in columns.items()},
         given,
         usable=log.read_in(rows)[kept] if log.apart else None,
-        stamped_commands=not set(log.of_actions) & set(log.of_states),
+        command_period=log.command_period,
     )
 
 
@@ -142,6 +142,14 @@ class _Log:
     def of_actions(self) -> list[str]:
         """The topics of the actions, each once."""
         return list(dict.fromkeys(self.columns[action.name][0] for action in self.system.actions))
+
+    @property
+    def command_period(self) -> float | None:
+        """Median s between the slowest commands; None where they have the stamps of readings, or one was sent once."""
+        stamps = [self.topics[name].time for name in self.of_actions if name not in self.of_states]
+        if len(stamps) < len(self.of_actions) or any(len(each) < 2 for each in stamps):
+            return None
+        return max(float(np.median(np.diff(each))) for each in stamps)
 
     @cached_property
     def apart(self) -> list[str]:

@@ -18,7 +18,8 @@ class GoalTarget(TaskTarget):
     """A target that shows no goal, with the goals of a task; where its flights start is its own.
 
     Raises:
-        TargetError: `reset` starts more than LARGEST_START_ERROR from where the task's flights start.
+        TargetError: `reset` starts more than LARGEST_START_ERROR from where the task's flights start, or shows another
+            number of states than the task's vehicle has.
     """
 
     start: str
@@ -34,6 +35,8 @@ class GoalTarget(TaskTarget):
         state, self.first = self.task.evaluation_start(batch, generator)
         self._task_state = self.first
         seen = checked_copy(self.target, self.target.reset(batch, generator), batch)
+        if (shown := seen.state.shape[1]) != state.shape[1]:
+            raise TargetError(f"{self.name}: shows {shown} states; the {state.shape[1]} of its vehicle are right")
         off = float((seen.state[:, POSITION] - state[:, POSITION].to(seen.state)).norm(dim=1).max())
         if off > LARGEST_START_ERROR:
             raise TargetError(f"{self.name}: starts {off:.3g} m from {self.start}; {self.right}")

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from visadapt.targets.base import Target
+import torch
+
+from visadapt.systems.rigid_body import POSITION, VELOCITY
+from visadapt.targets.base import Observation, Target, TargetError
 from visadapt.targets.goals import GoalTarget
 from visadapt.tasks.reach import Reach
 
@@ -15,7 +18,7 @@ class ReachingTarget(GoalTarget):
         task: where the points are; without it, 50 m ahead.
 
     Raises:
-        TargetError: `reset` starts more than a metre from the origin.
+        TargetError: `reset` starts more than a metre from the origin, or in flight away from a point.
 
     >>> import torch, visadapt as va
     >>> class Rig(va.Target):
@@ -35,3 +38,15 @@ class ReachingTarget(GoalTarget):
 
     def __init__(self, target: Target, task: Reach | None = None) -> None:
         super().__init__(target, task or Reach(target.period))
+
+    def reset(self, batch: int, generator: torch.Generator) -> Observation:
+        seen = super().reset(batch, generator)
+        assert seen.goal is not None
+        ahead = ((seen.goal - seen.state[:, POSITION]) * seen.state[:, VELOCITY]).sum(1) > 0
+        if not bool(ahead.all()):
+            x, y, z = seen.state[~ahead][0, VELOCITY].tolist()
+            raise TargetError(
+                f"{self.name}: starts at ({x:.3g}, {y:.3g}, {z:.3g}) m/s, away from the points ahead, which lie along "
+                "x: an x axis along which flights start is right"
+            )
+        return seen

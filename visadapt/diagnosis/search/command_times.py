@@ -24,6 +24,11 @@ EARLIER_LOG_ODDS = 20.0
 
 MIN_PART = 0.02  # Share of a row by which commands must act early to be moved
 
+THINNED_PARTS = (0.2, 0.6)
+"""Range of the share of the time between logged commands by which these act early where their log keeps only some of
+those that were sent: from a quarter, of every second one, to a half. Commands that act earlier, or less early, reached
+their log late."""
+
 MOST_BESIDE_LATE = 2
 """Most effects that are fitted beside the lateness of commands that have stamps of their own, which often are late.
 None are fitted beside that of others, which is rare."""
@@ -51,7 +56,8 @@ def with_commands_that_act(draft: Draft, catalogue: Sequence[type[Effect]]) -> D
     row, where the recording has each beside the readings that it led to; earlier by part of a row; or, where the
     controller is faster than the rows, with an estimate of what it sent between them."""
     given = _Moved.of(draft, catalogue, None)
-    stamped = draft.readings.recording.stamped_commands
+    logged_every = draft.readings.recording.command_period
+    stamped = logged_every is not None
     if not stamped and (period := _controllers_period(draft.readings)) is not None:
         by_clock = _Moved.of(draft, catalogue, _sent_until_next_row)
         if sign_conventions.stays_ahead(by_clock.search, given.search, EARLIER_LOG_ODDS):
@@ -71,13 +77,15 @@ def with_commands_that_act(draft: Draft, catalogue: Sequence[type[Effect]]) -> D
         ways += [_likeliest(draft, catalogue, given)] if stamped else []
         for by, earlier in ways:
             stays = sign_conventions.stays_ahead(earlier.search, given.search, EARLIER_LOG_ODDS)
-            if stays and sign_conventions.ahead(earlier.search, likelier.search) > 0:
+            if stays and (likelier is given or earlier.search.best.log_odds > likelier.search.best.log_odds):
                 late, likelier = by, earlier
     if not stamped and (faster := _faster_than_rows(draft, catalogue, likelier)) is not None:
         return faster
     if likelier is not given:
         moved = f"the commands act {number(late, 2)} s before the rows that they are in: {PART_LATE}"
-        return likelier.told(moved, *([THINNED] if stamped else []))
+        least, most = THINNED_PARTS
+        thinned = logged_every is not None and least < late / logged_every < most
+        return likelier.told(moved, *([THINNED] if thinned else []))
     return replace(draft, source=given.search.source.fits)
 
 

@@ -30,16 +30,19 @@ def shown_by(effects: Sequence[type[Effect]], measured: set[int]) -> list[type[E
     """The effects that readings of the columns `measured` can show.
 
     Left out are effects of a camera; a delay of sensors none of which was read; a delay of exactly the sensors that
-    were read, if `MeasurementDelay`, which then does the same, is searched too; and all scales but the first of the
-    same sensors.
+    were read, if `MeasurementDelay`, which then does the same, is searched too; and all scales but one of the same
+    sensors: the first, or the first whose position was read.
     """
     all_late = any(issubclass(effect, MeasurementDelay) for effect in effects)
-    first: dict[frozenset[int], type[Effect]] = {}
+    scales = [effect for effect in effects if issubclass(effect, SensorGain)]
+    kept: dict[frozenset[int], type[Effect]] = {}
+    for effect in sorted(scales, key=lambda effect: effect.columns[0] not in measured):
+        if read := measured.intersection(effect.columns):
+            kept.setdefault(frozenset(read), effect)
 
     def shows(effect: type[Effect]) -> bool:
         if issubclass(effect, SensorGain):
-            read = frozenset(measured.intersection(effect.columns))
-            return bool(read) and first.setdefault(read, effect) is effect
+            return effect in kept.values()
         if not issubclass(effect, LateSensors) or issubclass(effect, MeasurementDelay):
             return effect.stage is not Stage.CAMERA
         late = measured & set(effect.late)

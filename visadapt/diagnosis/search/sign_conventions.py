@@ -76,19 +76,19 @@ def stays_ahead(
         search.try_late_sensors()
     bases = beside()
     for added in range(MOST_EFFECTS_ADDED):
-        if added >= EFFECTS_ADDED and not 0 < ahead(other, as_given) <= required:
+        if added >= EFFECTS_ADDED and not 0 < _ahead(other, as_given) <= required:
             break
         for search in (as_given, other):
             search.extend([search.best], LEADS)
         bases = [max(other.extend([base], LEADS), key=lambda each: each.log_odds, default=base) for base in bases]
-    if ahead(other, as_given) <= required:
+    if _ahead(other, as_given) <= required:
         return False
     # What explains the other way may explain this one as well, and not be among the leads of its own sets.
     same = as_given.fit([(other.best.effects, other.best.fits)], QUICK) if other.best.effects else []
     return all(_likelihood(other) - float(each.fits.likelihood[0]) > required for each in same)
 
 
-def ahead(one: Search, other: Search) -> float:
+def _ahead(one: Search, other: Search) -> float:
     """Log likelihood by which the best set so far of one search exceeds that of another."""
     return _likelihood(one) - _likelihood(other)
 
