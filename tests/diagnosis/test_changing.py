@@ -46,6 +46,7 @@ def test_its_size_is_said_from_stretch_to_stretch(effect, parameter, values):
     )
     assert (found.verdict, found.next_experiment) == ("unexplained", AS_IT_CHANGES)
     np.testing.assert_allclose(sizes(found.warnings, effect.name.replace("_", " ")), values, rtol=0.1)
+    assert {cause.effect for cause in found.partial} <= {effect.name}  # others imitate the change
     assert str(found).startswith("unexplained: The size of an effect changes within the recording")
 
 

@@ -108,6 +108,9 @@ def _answer(
     found = explaining if verdict in (IDENTIFIED, AMBIGUOUS) else ()
     closes = verdict == UNEXPLAINED and not measured.gap.closed <= 0  # NaN where the source predicts within the noise
     partial = tuple(without_slight(explaining)) if closes else ()
+    if explored.changes:  # what else closes a part of the gap imitates the change
+        changing = {effect.name for each in explored.changes for effect in each.effects}
+        partial = tuple(cause for cause in partial if cause.effect in changing)
     source_leaves = [] if found else left_by_source(search)
     # Where the causes explain the recording, the pushes are those beyond them.
     beyond = (comparison.best, comparison.functions) if found else (search.source, source_leaves)

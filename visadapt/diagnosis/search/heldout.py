@@ -25,8 +25,9 @@ from visadapt.diagnosis.search.unexplained import loads_of
 from visadapt.estimation.candidate import COARSE, CandidateModel
 from visadapt.estimation.fit_states import Effects
 from visadapt.estimation.fitting import refitted
-from visadapt.estimation.kalman import backward, forward
-from visadapt.estimation.likelihood import FitState, linear_problem, variances
+from visadapt.estimation.iterated_smoother import smoothed_states
+from visadapt.estimation.kalman import Linear
+from visadapt.estimation.likelihood import FitState
 from visadapt.estimation.profiles import profile_of
 from visadapt.estimation.segments import Segments
 from visadapt.processes import shared_out
@@ -207,13 +208,13 @@ def rollout_errors(
     length = rows.shape[1]
     if black_box is not None:
         fits = replace(fits, log_process=black_box.fits.log_process)
-    problem = linear_problem([model], fits).data()
-    if black_box is not None:
-        loads = black_box.loads(inputs(model, fits.state[0])[:, :-1, None]) * rows.inside[:, 1:, None, None]
-        problem = replace(problem, drive=problem.drive + (loads_of(model, fits) * loads).sum(-1, keepdim=True))
-    smoothed, _ = backward(forward(problem, *variances(model, fits, problem)))
-    # A set that cannot be simulated, with a mass matrix that is singular, say, is predicted from where it was fitted.
-    estimated = fits.state[0] + smoothed[..., 0].nan_to_num(0, 0, 0)
+
+    def driven(model: CandidateModel, fits: FitState, problem: Linear) -> Linear:
+        assert black_box is not None
+        loads = black_box.loads(inputs(model, fits.state[0])[:, :-1, None]) * model.rows.inside[:, 1:, None, None]
+        return replace(problem, drive=problem.drive + (loads_of(model, fits) * loads).sum(-1, keepdim=True))
+
+    estimated = smoothed_states(model, fits, None if black_box is None else driven)
     predicted = _rollouts(model, fits.theta[0], estimated, horizon, stride, black_box)
 
     measured, shown = model.shown(fits.theta[0])
