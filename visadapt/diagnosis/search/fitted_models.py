@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from visadapt.diagnosis.search.model_evidence import log_posterior_odds
-from visadapt.effects import Effect
+from visadapt.effects import DynamicsEffect, Effect
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.fit_states import (
     CAREFUL,
@@ -24,7 +24,8 @@ from visadapt.estimation.fit_states import (
     with_effect,
 )
 from visadapt.estimation.fitting import fit
-from visadapt.estimation.likelihood import FitState
+from visadapt.estimation.iterated_smoother import smoothed_states
+from visadapt.estimation.likelihood import FitState, min_log_process
 from visadapt.estimation.profiles import profile_of
 from visadapt.estimation.screening import Candidate, screen
 from visadapt.estimation.segments import Segments
@@ -183,11 +184,21 @@ class FittedModels:
         Where a set is likelier without, that fit replaces the other one, which has ended where process noise explains
         what other parameters would.
         """
-        out = self._fits([(each.effects, each.fits) for each in sets], CAREFUL, rival, process_noise=False)
+        starts = [(each.effects, self._at_rest(each)) for each in sets]
+        out = self._fits(starts, CAREFUL, rival, process_noise=False)
         for each, fits in zip(sets, out, strict=True):
             if fits.likelihood > each.fits.likelihood + MIN_BETTER:
                 self._keep(each.effects, fits)
         return out
+
+    def _at_rest(self, found: ScoredModel) -> FitState:
+        """The fit of a set with the states that are most probable without process noise, where joints come to rest."""
+        if not any(issubclass(effect, DynamicsEffect) and effect.rubs() for effect in found.effects):
+            return found.fits
+        model = CandidateModel(self.system, found.effects, self.rows, CAREFUL[1])
+        least = torch.full_like(found.fits.log_process, min_log_process(self.rows.period))
+        state = smoothed_states(model, replace(found.fits, log_process=least))
+        return replace(found.fits, state=state[None])
 
     def fit(
         self,
