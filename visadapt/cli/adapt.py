@@ -89,7 +89,8 @@ def _in_words(explanation: Explanation) -> str:
     slight = explanation.slight
     causes = _named(sorted(explanation.effects, key=lambda effect: effect.name in slight), slight)
     others = " or ".join(_named(each, slight) for each in explanation.others)
-    alike = f"; as well explained by {others} (to tune the policy for that: --effect)" if others else ""
+    instead = "to tune the policy for that, give --effect NAME:PARAMETER=VALUE instead of --diagnose"
+    alike = f"; as well explained by {others} ({instead})" if others else ""
     if explanation.complete:
         return f"{explanation.verdict}: {causes or 'the policy is left as it was'}{alike}"
     learnt = f"{causes}; a residual learnt what they leave" if causes else "a residual learnt the gap"

@@ -137,7 +137,8 @@ def in_turn(changes: Sequence[Changing]) -> str:
     first = changes[0]
     if first.files:
         return f"{CHANGES_BETWEEN}: {listed(first.files)}, in this order, are explained by {listed(sets, 'or')}"
-    return f"{CHANGES}: {len(first.values)} stretches of it, one after the other, are explained by {listed(sets, 'or')}"
+    start = f"from {', '.join(number(each) for each in first.starts)} s on" if first.starts else "one after the other"
+    return f"{CHANGES}: {len(first.values)} stretches of it, {start}, are explained by {listed(sets, 'or')}"
 
 
 def _in_turn(parameter: Parameter, values: Sequence[float]) -> str:

@@ -16,7 +16,7 @@ from visadapt.recordings.episode import RecordingError
 from visadapt.recordings.runs import runs
 from visadapt.recordings.sensors import FROZEN_ROWS, differences, variable_of
 from visadapt.recordings.slow_sensors import with_usable
-from visadapt.systems import System
+from visadapt.systems import CartPole, System, Variable
 
 OUTLIER_SCALES = 50.0
 """Jump of a reading above which it may be an outlier, in usual departures from the mean of its neighbours."""
@@ -63,7 +63,8 @@ def without_outliers(raw: RawEpisode, system: System, note: Note) -> RawEpisode:
         allowed = variable.largest
         if rate is not None:
             allowed = min(allowed, 2 * float(np.median(np.diff(raw.time[rows]))) * variable_of(system, rate).largest)
-        outliers = _outliers(differences(values, variable.unit == "rad"), values, allowed)
+        changes = differences(values, variable.unit == "rad")
+        outliers = _outliers(changes, values, allowed)
         if outliers.mean() > MOST_OUTLIERS:
             first = int(outliers.argmax())
             raise RecordingError(
@@ -76,9 +77,8 @@ def without_outliers(raw: RawEpisode, system: System, note: Note) -> RawEpisode:
                 f"{raw.cell(row, name)}: {raw.states[name][row]:g}",
             )
         bad[rows[outliers]] = True
-        # An angle that stands still in places is an effect of the catalogue.
-        if rate is not None and variable.unit != "rad":
-            for start, end in _stuck(raw.state[rows], values):
+        if rate is not None and not _may_stand_still(variable, system):
+            for start, end in _stuck(raw.state[rows], values, changes):
                 note(
                     f"{name} repeats a reading, then jumps: its sensor stuck; these rows' readings were set aside",
                     f"{raw.cell(int(rows[start]), name)}, and {end - start - 1} rows after it",
@@ -107,10 +107,17 @@ def _outliers(steps: NDArray[np.float64], values: NDArray[np.float64], allowed: 
     return bad
 
 
-def _stuck(state: NDArray[np.float64], values: NDArray[np.float64]) -> Iterator[tuple[int, int]]:
+def _may_stand_still(variable: Variable, system: System) -> bool:
+    """Whether readings of a variable that stand still in places are an effect of the catalogue."""
+    return isinstance(system, CartPole) and variable.unit == "rad"
+
+
+def _stuck(
+    state: NDArray[np.float64], values: NDArray[np.float64], changes: NDArray[np.float64]
+) -> Iterator[tuple[int, int]]:
     """First row, and the row after the last, of each run in which a sensor of `values` (T,), one of those of `state`
-    (T, n_measured), repeats an earlier one."""
-    steps, least = _steps(values)
+    (T, n_measured), with these `changes` (T - 1,), repeats an earlier one."""
+    steps, least = _steps(changes)
     for start, end in runs(values):
         lost = (state[start:end] == state[start]).all()  # whole rows, which are an effect of the catalogue
         if end - start < STUCK_ROWS or end + 1 >= len(values) or lost:
@@ -124,10 +131,9 @@ def _outages(raw: RawEpisode, system: System) -> Iterator[tuple[int, int]]:
     many for rows lost one by one, and zeros to or from which a position jumps, or the last readings of a machine that
     moved, from which one jumps."""
     positions = [raw.measured.index(name) for name in raw.measured if system.rate_of(name) is not None]
-    # An angle that stands still in places is an effect of the catalogue.
-    if not positions or (len(raw.measured) == 1 and variable_of(system, raw.measured[0]).unit == "rad"):
+    if not positions or (len(raw.measured) == 1 and _may_stand_still(variable_of(system, raw.measured[0]), system)):
         return
-    steps, least = _steps(raw.state[:, positions])
+    steps, least = _steps(np.diff(raw.state[:, positions], axis=0))
     repeated = np.append(False, (raw.state[1:] == raw.state[:-1]).all(1))
     for start, end in runs((~repeated).cumsum()):
         others = (repeated.sum() - (end - start - 1) + 1) / len(repeated)
@@ -141,9 +147,9 @@ def _outages(raw: RawEpisode, system: System) -> Iterator[tuple[int, int]]:
             yield start + 1, end
 
 
-def _steps(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Sizes (T - 1, ...) of the changes of positions (T, ...), and the least (...) from which on one may be a jump."""
-    steps = np.abs(np.diff(values, axis=0))
+def _steps(changes: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Sizes (T - 1, ...) of the changes of positions, and the least (...) from which on one may be a jump."""
+    steps = np.abs(changes)
     return steps, STUCK_STEPS * np.where(steps > 0, steps, np.inf).min(0, initial=np.inf)
 
 

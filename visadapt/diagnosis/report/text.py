@@ -57,7 +57,8 @@ def region(one: Region, system: str) -> str:
     """Where a region lies: "x from 0.10 to 0.40 m"."""
     if one.variable == "episode":
         return f"episodes {one.start:.0f} to {one.end:.0f}" if one.end > one.start else f"episode {one.start:.0f}"
-    span = with_unit(f"{number(one.start, 2)} to {number(one.end, 2)}", unit_of(one.variable, system))
+    start, end = (f"{at:.2f}" if one.variable == "time" else number(at, 2) for at in (one.start, one.end))
+    span = with_unit(f"{start} to {end}", unit_of(one.variable, system))
     return f"{one.variable} from {span}"
 
 

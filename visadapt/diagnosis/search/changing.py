@@ -46,6 +46,7 @@ class Changing:
     values: tuple[tuple[float, ...], ...]  # of their parameters, in each stretch, in the order of time
     log_odds: float
     files: tuple[str, ...] = ()  # which the stretches are, where sizes change from file to file alone; else none
+    starts: tuple[float, ...] = ()  # s at which the stretches start, where all are of one episode; else none
 
 
 def changing(search: Search, sources: Sequence[str]) -> tuple[Changing, ...]:
@@ -58,7 +59,12 @@ def changing(search: Search, sources: Sequence[str]) -> tuple[Changing, ...]:
     if 1 < len(files) <= MOST_PARTS and (found := _between(search, list(files.values()))):
         return tuple(replace(one, files=tuple(files)) for one in found)
     count = search.rows.shape[0]
-    return () if count < FEWEST_PARTS else _between(search, torch.arange(count).tensor_split(min(MOST_PARTS, count)))
+    if count < FEWEST_PARTS:
+        return ()
+    parts, starts = torch.arange(count).tensor_split(min(MOST_PARTS, count)), ()
+    if len(search.rows.episode.unique()) == 1:
+        starts = tuple(float(search.rows.time[part[0], 0]) for part in parts)
+    return tuple(replace(one, starts=starts) for one in _between(search, parts))
 
 
 def _between(search: Search, parts: Sequence[Tensor]) -> tuple[Changing, ...]:

@@ -27,6 +27,9 @@ SHORTEST, SHORTEST_AT_END = 1.5, 1.0
 """Prediction times that a joint stands still, at least; and where it does so to the end of its episode."""
 SLOW = 0.3  # Acceleration of a joint that stands still, over that by the load that would hold it, at most
 STILL = 0.1  # Prediction times in which that load would give it the speed that it has, at most
+SLOWER = 0.3
+"""Mean speed in a stretch over the median elsewhere, at most: a joint that balances another body, of a mass that is not
+known, is as fast as ever."""
 LONGEST_GAP = 0.2  # Prediction times for which a joint may look moved while it is held, as where its load passes zero
 MUCH = 3.0
 """Load that holds a joint, over its dry friction and over what is left unexplained elsewhere, at least."""
@@ -212,6 +215,7 @@ def _held(joints: dict[int, _Joint]) -> list[tuple[int, _Held]]:
     by_motion = torch.cat([joint.by_motion[rows] for joint, rows in zip(joints.values(), apart, strict=True)])
     weights = torch.linalg.lstsq(by_motion, needed[:, None]).solution
     dry_friction, left = float(weights[0]), float(needed.square().mean().sqrt())
+    usual = float(by_motion[:, 1].abs().median())
     found = []
     for number, held in ((number, held) for number, every in possible.items() for held in every):
         joint, load = joints[number], joints[number].load(held)
@@ -219,6 +223,7 @@ def _held(joints: dict[int, _Joint]) -> list[tuple[int, _Held]]:
         other = float((joint.needed[rows] - (joint.by_motion[rows] @ weights)[:, 0]).mean().abs())
         # Equal readings have no noise, of which the loads elsewhere consist in part.
         least = MUCH * (dry_friction if held.repeats else max(dry_friction, left))
-        if load > least and (held.repeats or other > LEAST_OTHER * load):
+        stands = float(joint.velocity[rows].abs().nanmean()) < SLOWER * usual
+        if load > least and (held.repeats or (stands and other > LEAST_OTHER * load)):
             found.append((number, held))
     return found
