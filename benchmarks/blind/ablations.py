@@ -14,6 +14,7 @@ from visadapt.diagnosis.search import heldout, search
 from visadapt.diagnosis.search.fitted_models import MIN_LEFTOVER, FittedModels, ScoredModel, less
 from visadapt.diagnosis.search.model_comparison import ModelComparison
 from visadapt.diagnosis.search.search import TWO_FOR_ONE_UP_TO, Exchanges, Search
+from visadapt.estimation import iterated_smoother
 from visadapt.estimation.fit_states import QUICK, Effects
 from visadapt.estimation.likelihood import FitState
 
@@ -107,6 +108,7 @@ PARTS = {
     ),
     "careful fits": Part(Search, "_polish", _nothing),
     "starts without process noise": Part(Search, "_fit_from_quiet", _fit_with_noise),
+    "states where joints rest": Part(iterated_smoother, "_verified", lambda model, fits, state, *_: state),
     "late sensors": Part(Search, "_fit_late", _nothing, lambda _, self, bases: bool(bases)),
     "phases of episodes": Part(Search, "_phases_of_episodes", _nothing),
     "jumps": Part(EXPLORATION, "with_jumps", _nothing, lambda out, _: out is not None),

@@ -70,6 +70,10 @@ def test_what_changes_within_a_recording_is_no_push():
     found = diagnose(Recording((episode,), measured, period, ("run.csv",)), World(CartPole()), CATALOGUE)
     assert sizes(found.warnings, "viscous friction")[::4] == pytest.approx([0.0, 4.0], abs=0.1)
     assert found.where.pushes == ()
+    (said,) = (warning for warning in found.warnings if warning.startswith(CHANGES))
+    starts = said.partition("stretches of it, from ")[2].partition(" s on")[0].split(", ")
+    assert float(starts[0]) == 0
+    assert len(starts) == len(sizes(found.warnings, "viscous friction"))
 
 
 class Ridges(CartForce):

@@ -4,6 +4,8 @@ does by itself is left alone."""
 import numpy as np
 import pytest
 
+import visadapt as va
+from tests.own_systems import Pendulum
 from tests.recorded import a_run, load, write
 
 ROWS = 200
@@ -34,6 +36,16 @@ def test_what_a_stuck_sensor_repeats_is_set_aside(file, run):
     np.testing.assert_allclose(np.diff(episode.state[60:76, 0]), (true[75] - true[60]) / 15)
     (said,) = (one for one in recording.warnings if "stuck" in one)
     assert said.startswith(f"{file}: row 62 (line 63), column 'x', and 13 rows after it: x repeats a reading")
+
+
+def test_an_angle_that_sticks_is_set_aside_where_no_effect_does_that(file):
+    time = 0.02 * np.arange(ROWS)
+    angle = 3.0 + np.sin(4 * time)  # beyond half a turn, where an angle is read with the other sign
+    angle[61:75] = angle[60]
+    read = {"time": time, "angle": (angle + np.pi) % (2 * np.pi) - np.pi, "torque": np.sin(3 * time)}
+    recording = va.load_recording(write(file, read), Pendulum())
+    (usable,) = (read.all(1) for read in recording.usable)
+    assert np.flatnonzero(~usable).tolist() == list(range(61, 75))
 
 
 def test_a_cart_that_dry_friction_holds_has_no_stuck_sensor(file, run):

@@ -37,27 +37,28 @@ def smoothed_states(model: CandidateModel, fits: FitState, driven: Driven | None
     correction, decrease = at.correction()
     state = fits.state[0] + correction
     unsure = (decrease > NOT_LINEAR).nonzero()[:, 0]
-    if len(unsure):
-        few = CandidateModel(model.system, model.effects, model.rows.select(unsure), model.accuracy)
-        state[unsure] = _most_probable(few, fits.on(unsure), at[unsure], driven)
-    return state
+    return _verified(model, fits, state, at[unsure], unsure, driven) if len(unsure) else state
 
 
-def _most_probable(model: CandidateModel, fits: FitState, best: _Linearised, driven: Driven | None) -> Tensor:
-    """The most probable states (W, T, n) from those of `best` on."""
-    damping = best.improbable.new_full((len(best.improbable),), FIRST_DAMPING)
-    scale = best.state.new_tensor([one.scale for one in model.system.states])
+def _verified(
+    model: CandidateModel, fits: FitState, state: Tensor, best: _Linearised, unsure: Tensor, driven: Driven | None
+) -> Tensor:
+    """The states (W, T, n), those of the windows `unsure` (N,) by damped corrections, each of which is verified, of the
+    states of `best`."""
+    scale = state.new_tensor([one.scale for one in model.system.states])
+    damping = torch.full_like(best.improbable, FIRST_DAMPING)
     for _ in range(MOST_STEPS):
+        few = CandidateModel(model.system, model.effects, model.rows.select(unsure), model.accuracy)
         correction, _ = best.correction(damping[:, None] / scale.square())
-        model.slopes = None
-        tried = _Linearised.at(model, fits, best.state + correction, driven)
+        tried = _Linearised.at(few, fits.on(unsure), best.state + correction, driven)
         better = tried.improbable < best.improbable
-        best = tried.where(better, best)
-        damping = torch.where(better, damping / 10, damping * 10)
-        left = best.correction()[1] > NOT_LINEAR
-        if not bool((left & (damping < MAX_DAMPING)).any()):
+        best, damping = tried.where(better, best), torch.where(better, damping / 10, damping * 10)
+        state[unsure] = best.state
+        left = ((best.correction()[1] > NOT_LINEAR) & (damping < MAX_DAMPING)).nonzero()[:, 0]
+        unsure, best, damping = unsure[left], best[left], damping[left]
+        if not len(unsure):
             break
-    return best.state
+    return state
 
 
 @dataclass(frozen=True)

@@ -61,9 +61,9 @@ def changing(search: Search, sources: Sequence[str]) -> tuple[Changing, ...]:
     count = search.rows.shape[0]
     if count < FEWEST_PARTS:
         return ()
-    parts, starts = torch.arange(count).tensor_split(min(MOST_PARTS, count)), ()
-    if len(search.rows.episode.unique()) == 1:
-        starts = tuple(float(search.rows.time[part[0], 0]) for part in parts)
+    parts = torch.arange(count).tensor_split(min(MOST_PARTS, count))
+    one_episode = len(search.rows.episode.unique()) == 1
+    starts = tuple(float(search.rows.time[part[0], 0]) for part in parts if one_episode)
     return tuple(replace(one, starts=starts) for one in _between(search, parts))
 
 
