@@ -35,14 +35,14 @@ def save_renderer(path: Path, renderer: LayeredRenderer | MLPRenderer, training:
     write_tensors(path, weights, HEADER_KEY, json.dumps(header))
 
 
-def load_renderer(path: Path, size: tuple[int, int] | None = None) -> LayeredRenderer | MLPRenderer:
+def load_renderer(path: str | Path, size: tuple[int, int] | None = None) -> LayeredRenderer | MLPRenderer:
     """The renderer in a file, of the class that was saved, on the CPU; `size` is the (height, width) it must have.
 
     Raises:
         RendererError: the file is missing, incomplete, or not a renderer's; or the renderer has another architecture
             or frame size.
     """
-    metadata, weights = read_tensors(path, "renderer", RendererError)
+    metadata, weights = read_tensors(Path(path), "renderer", RendererError)
     entry = metadata.get(HEADER_KEY)
     if entry is None:
         raise RendererError(f"{path}: a safetensors file, but not a renderer's")

@@ -21,7 +21,7 @@ def test_from_recorded_frames_and_states(here, capsys):
     said = capsys.readouterr().out
     assert "grey levels of 255 off where cart and pole are" in said
     assert "the pose is read, x 0.0" in said
-    renderer = load_renderer(here / "r.safetensors")
+    renderer = load_renderer(str(here / "r.safetensors"))
     assert renderer.size == (40, 48)
     # Nearer to the camera than the guess, 1.5 px to the left of it.
     assert abs(float(renderer.state_dict()["origin"][0]) - CAMERA.column) < 1.0

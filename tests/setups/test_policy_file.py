@@ -109,3 +109,8 @@ class TestOwnSetup:
         save_policy(path, StatePolicy(4), {"source": {**describe(va.World(va.CartPole())), "system": "unicycle"}})
         with pytest.raises(CheckpointError, match="needs 'unicycle', which is not known here: import the file"):
             load_source(path)
+
+
+def test_exchanged_arguments_are_said(tmp_path):
+    with pytest.raises(TypeError, match=r"^save_policy takes a path, then a policy .* a ReachPolicy, then a str$"):
+        save_policy(ReachPolicy(), str(tmp_path / "policy.safetensors"))

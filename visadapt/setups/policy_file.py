@@ -52,6 +52,7 @@ def save_policy(path: str | Path, policy: Policy, about: Mapping[str, Any] | Non
 
     Raises:
         DiskFullError: the disk is full; what stood at `path` before stays.
+        TypeError: something else than a policy is to be written, as where the two arguments are exchanged.
 
     >>> import visadapt as va, tempfile, pathlib
     >>> path = pathlib.Path(tempfile.mkdtemp()) / "policy.safetensors"
@@ -59,6 +60,9 @@ def save_policy(path: str | Path, policy: Policy, about: Mapping[str, Any] | Non
     >>> type(va.load_policy(path)).__name__
     'FollowPolicy'
     """
+    if not isinstance(policy, Policy):
+        given = f"a {type(path).__name__}, then a {type(policy).__name__}"
+        raise TypeError(f"save_policy takes a path, then a policy of visadapt; it was given {given}")
     settings: dict[str, Any] = {"arguments": policy.arguments}
     settings |= {"grounded_in": policy.grounded_in, "source": policy.trained_in}
     if policy.residual is not None and isinstance(policy.residual.network, FlightResidualNetwork):
