@@ -4,7 +4,7 @@ from typing import Any
 import pytest
 
 from visadapt.diagnosis.next_experiment import explain, separate
-from visadapt.diagnosis.result import AMBIGUOUS, Cause
+from visadapt.diagnosis.result import AMBIGUOUS, Cause, Gap
 from visadapt.diagnosis.search.causes import Alternative
 from visadapt.diagnosis.search.unexplained import SmoothFunction
 from visadapt.diagnosis.verdict import next_step, of_many
@@ -44,7 +44,9 @@ def test_slight_causes_need_no_experiment():
     pairs: list[list[type[Effect]]] = [[ActuatorBias, ConstantForce], [CoulombFriction, QuadraticDrag]]
     groups = [[Alternative(effect, nothing, effect) for effect in pair] for pair in pairs]
     found = [Cause(effect.name, {}, 0.5, 0.5, slight=pair is pairs[1]) for pair in pairs for effect in pair]
-    advice = next_step(search, nothing, AMBIGUOUS, groups, found, nothing, (), (), (), False)
+    comparison: Any = SimpleNamespace(unexplained=lambda improvable: True)
+    gap = Gap("", 100.0, 4.0, 1.0, 4.0, 0.97)
+    advice = next_step(search, comparison, AMBIGUOUS, groups, found, gap, (), (), (), False)
     assert advice.startswith("To tell actuator_bias and constant_force apart: ")
     assert "friction" not in advice
 

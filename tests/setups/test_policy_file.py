@@ -113,4 +113,4 @@ class TestOwnSetup:
 
 def test_exchanged_arguments_are_said(tmp_path):
     with pytest.raises(TypeError, match=r"^save_policy takes a path, then a policy .* a ReachPolicy, then a str$"):
-        save_policy(ReachPolicy(), str(tmp_path / "policy.safetensors"))
+        save_policy(ReachPolicy(), str(tmp_path / "policy.safetensors"))  # type: ignore[arg-type]

@@ -39,6 +39,7 @@ from visadapt.diagnosis.search.unexplained_load import unread_states
 from visadapt.diagnosis.verdict import (
     at_bounds,
     hovers,
+    imitating,
     in_turn,
     late_by_less_than,
     left_unexplained,
@@ -252,6 +253,7 @@ def _warnings(answered: Answer, origin: str) -> Iterator[str]:
         yield in_turn(explored.changes)
     unexplained = comparison.unexplained(measured.improvable)
     yield from left_unexplained(comparison, verdict, unexplained)
+    yield from imitating(found, measured.gap, unexplained)
     yield from at_bounds(comparison, found, explored.effects)
     bare = comparison.unchanged
     yield from shown_by_episodes(comparison, verdict, unexplained)

@@ -39,6 +39,9 @@ HOVERING = 0.2  # m/s, root mean square of a vehicle's speed up to which it hard
 
 AIR = (AirDrag, RotorDrag, QuadraticDrag)  # Effects that depend on the velocity against the air
 
+NEARLY_ALL = 0.95
+"""Share of what causes close together that each of two must close alone for one to be able to stand for the other."""
+
 CLOSES_BUT = "the causes close the gap but do not explain everything"
 """What the warning of `left_unexplained` begins with."""
 
@@ -113,7 +116,9 @@ def next_step(
         return next_experiment.explain(comparison.functions if closed else source_leaves, pushed)
     carrying = {cause.effect for cause in without_slight(found)}
     classes = [[one.effect for one in group] for group in groups]
-    return next_experiment.separate([c for c in classes if carrying & {one.name for one in c}], search.system)
+    classes = [each for each in classes if carrying & {one.name for one in each}]
+    imitators = _imitators(found, gap, comparison.unexplained(False))
+    return next_experiment.separate([*classes, [EFFECTS[one.effect] for one in imitators]], search.system)
 
 
 def one_by_one(apart: Sequence[ExplainedAlone]) -> str:
@@ -269,3 +274,27 @@ def left_unexplained(comparison: ModelComparison, verdict: str, unexplained: boo
     if verdict in (IDENTIFIED, AMBIGUOUS) and unexplained:
         return [f"{CLOSES_BUT}: {next_experiment.disturbance_in_words(comparison.functions)}"]
     return []
+
+
+def imitating(found: Sequence[Cause], gap: Gap, unexplained: bool) -> list[str]:
+    """A warning where causes are named although they leave something, and each of several closes nearly as much alone:
+    what tells them apart is no larger than what no effect explains."""
+    alone = _imitators(found, gap, unexplained)
+    if not alone:
+        return []
+    shares = ", ".join(f"{100 * cause.gap_closed:.0f} %" for cause in alone)
+    return [
+        f"{listed([plain(cause.effect) for cause in alone])} each close nearly as much alone ({shares}) as all causes "
+        f"together ({100 * gap.closed:.0f} %), and not everything is explained: one of them may only imitate another"
+    ]
+
+
+def _imitators(found: Sequence[Cause], gap: Gap, unexplained: bool) -> list[Cause]:
+    """Causes that each close nearly as much alone as all together, where something is unexplained; none, if there is
+    one such cause. Of those that are said to fit as well as each other, the first."""
+    alone: list[Cause] = []
+    for cause in without_slight(found):
+        known_alike = any(cause.effect in other.indistinguishable_from for other in alone)
+        if cause.gap_closed >= NEARLY_ALL * gap.closed and not known_alike:
+            alone.append(cause)
+    return alone if unexplained and len(alone) > 1 else []

@@ -61,8 +61,10 @@ def save_policy(path: str | Path, policy: Policy, about: Mapping[str, Any] | Non
     'FollowPolicy'
     """
     if not isinstance(policy, Policy):
-        given = f"a {type(path).__name__}, then a {type(policy).__name__}"
-        raise TypeError(f"save_policy takes a path, then a policy of visadapt; it was given {given}")
+        raise TypeError(  # type: ignore[unreachable]  # where the caller's types are not checked
+            f"save_policy takes a path, then a policy of visadapt; it was given a {type(path).__name__}, then a "
+            f"{type(policy).__name__}"
+        )
     settings: dict[str, Any] = {"arguments": policy.arguments}
     settings |= {"grounded_in": policy.grounded_in, "source": policy.trained_in}
     if policy.residual is not None and isinstance(policy.residual.network, FlightResidualNetwork):
