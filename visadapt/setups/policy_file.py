@@ -61,7 +61,7 @@ def save_policy(path: str | Path, policy: Policy, about: Mapping[str, Any] | Non
     'FollowPolicy'
     """
     if not isinstance(policy, Policy):
-        raise TypeError(  # type: ignore[unreachable]  # where the caller's types are not checked
+        raise TypeError(
             f"save_policy takes a path, then a policy of visadapt; it was given a {type(path).__name__}, then a "
             f"{type(policy).__name__}"
         )
