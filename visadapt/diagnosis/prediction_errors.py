@@ -49,11 +49,11 @@ class PredictionErrors:
     def by_state(self, system: System, channels: Sequence[int], explained: bool) -> dict[str, float]:
         """Share by state of the squared error above `after` if the causes explain the gap, else above the noise floor.
 
-        NaN where the state was not measured.
+        NaN where the state was not measured, 0 where there is no gap: what is above the floor is then chance.
         """
         least = self.after if explained else self.floor
         excess = (self.before[-1].square() - least[-1].square()).clamp(min=0)
-        whole = float(excess.sum())
+        whole = 0.0 if math.isnan(self.gap().closed) else float(excess.sum())
         shares = {variable.name: math.nan for variable in system.states}
         for k, channel in enumerate(channels):
             shares[system.states[channel].name] = float(excess[k]) / whole if whole > 0 else 0.0
