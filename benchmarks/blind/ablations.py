@@ -10,13 +10,18 @@ from importlib import import_module
 from typing import Any
 from unittest.mock import patch
 
+import torch
+from torch import Tensor
+
 from visadapt.diagnosis.search import heldout, search
 from visadapt.diagnosis.search.fitted_models import MIN_LEFTOVER, FittedModels, ScoredModel, less
 from visadapt.diagnosis.search.model_comparison import ModelComparison
 from visadapt.diagnosis.search.search import TWO_FOR_ONE_UP_TO, Exchanges, Search
-from visadapt.estimation import iterated_smoother
+from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.fit_states import QUICK, Effects
-from visadapt.estimation.likelihood import FitState
+from visadapt.estimation.iterated_smoother import AddLoads
+from visadapt.estimation.kalman import backward, forward
+from visadapt.estimation.likelihood import FitState, linear_problem, variances
 
 EXPLORATION = import_module("visadapt.diagnosis.exploration")
 """The module; as an attribute of its package, the name is that of the function."""
@@ -90,6 +95,19 @@ def _fit_with_noise(self: Search, starts: Sequence[tuple[Effects, FitState]], ef
     self.fit(starts, effort)
 
 
+def _smoothed_once(model: CandidateModel, fits: FitState, add_loads: AddLoads | None) -> Tensor:
+    """The states (W, T, n) after one linear step."""
+    problem = linear_problem([model], fits).data()
+    problem = problem if add_loads is None else add_loads(model, fits, problem)
+    step = backward(forward(problem, *variances(model, fits, problem)))[0][..., 0]
+    return fits.state[0] + step.nan_to_num(0, 0, 0)
+
+
+def _verifies(out: Tensor, *given: Any) -> bool:
+    """Whether further steps were taken."""
+    return not torch.equal(out, _smoothed_once(*given))
+
+
 def _by_noise_and_black_box(self: ModelComparison, improvable: bool) -> bool:
     return improvable or self.leftover > MIN_LEFTOVER
 
@@ -108,7 +126,10 @@ PARTS = {
     ),
     "careful fits": Part(Search, "_polish", _nothing),
     "starts without process noise": Part(Search, "_fit_from_quiet", _fit_with_noise),
-    "states where joints rest": Part(iterated_smoother, "_verified", lambda model, fits, state, *_: state),
+    "fits at rest": Part(
+        FittedModels, "_at_rest", lambda _, found: found.fits, lambda out, _, found: out is not found.fits
+    ),
+    "verified states": Part(heldout, "smoothed_states", _smoothed_once, _verifies),
     "late sensors": Part(Search, "_fit_late", _nothing, lambda _, self, bases: bool(bases)),
     "phases of episodes": Part(Search, "_phases_of_episodes", _nothing),
     "jumps": Part(EXPLORATION, "with_jumps", _nothing, lambda out, _: out is not None),

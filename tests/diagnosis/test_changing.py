@@ -46,7 +46,7 @@ def test_its_size_is_said_from_stretch_to_stretch(effect, parameter, values):
     )
     assert (found.verdict, found.next_experiment) == ("unexplained", AS_IT_CHANGES)
     np.testing.assert_allclose(sizes(found.warnings, effect.name.replace("_", " ")), values, rtol=0.1)
-    assert {cause.effect for cause in found.partial} <= {effect.name}  # others imitate the change
+    assert [cause.effect for cause in found.partial] == [effect.name]  # what imitates the change is left out
     assert str(found).startswith("unexplained: The size of an effect changes within the recording")
 
 
@@ -71,7 +71,7 @@ def test_what_changes_within_a_recording_is_no_push():
     assert sizes(found.warnings, "viscous friction")[::4] == pytest.approx([0.0, 4.0], abs=0.1)
     assert found.where.pushes == ()
     (said,) = (warning for warning in found.warnings if warning.startswith(CHANGES))
-    starts = said.partition("stretches of it, from ")[2].partition(" s on")[0].split(", ")
+    starts = said.partition("stretches of it, from about ")[2].partition(" s on")[0].split(", ")
     assert float(starts[0]) == 0
     assert len(starts) == len(sizes(found.warnings, "viscous friction"))
 

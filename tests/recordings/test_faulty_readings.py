@@ -42,10 +42,18 @@ def test_an_angle_that_sticks_is_set_aside_where_no_effect_does_that(file):
     time = 0.02 * np.arange(ROWS)
     angle = 3.0 + np.sin(4 * time)  # beyond half a turn, where an angle is read with the other sign
     angle[61:75] = angle[60]
-    read = {"time": time, "angle": (angle + np.pi) % (2 * np.pi) - np.pi, "torque": np.sin(3 * time)}
-    recording = va.load_recording(write(file, read), Pendulum())
+    read = {"time": time, "angle": (angle + np.pi) % (2 * np.pi) - np.pi, "rate": 4 * np.cos(4 * time)}
+    recording = va.load_recording(write(file, {**read, "torque": np.sin(3 * time)}), Pendulum())
     (usable,) = (read.all(1) for read in recording.usable)
     assert np.flatnonzero(~usable).tolist() == list(range(61, 75))
+    assert any("its sensor stuck" in said for said in recording.warnings)
+
+
+def test_an_angle_that_rests_where_it_begins_a_new_turn_does_not_stick(file):
+    time, count = 0.02 * np.arange(2 * ROWS), 2 * np.pi / 1024
+    angle = np.pi + np.round(0.5 * np.exp(-2 * time) * np.cos(8 * time) / count) * count
+    read = {"time": time, "angle": (angle + np.pi) % (2 * np.pi) - np.pi, "torque": np.zeros(2 * ROWS)}
+    assert not va.load_recording(write(file, read), Pendulum()).usable
 
 
 def test_a_cart_that_dry_friction_holds_has_no_stuck_sensor(file, run):

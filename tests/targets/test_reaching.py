@@ -42,7 +42,7 @@ def test_it_is_flown_and_scored_as_a_target_with_the_task():
     ("wrong", "said"),
     [
         ({"away": 3.0}, "starts 3 m from the origin; positions from where a flight starts are right"),
-        ({"turned": True}, r"starts at \(-11.[0-9]+, .*\) m/s, away from the points ahead, which lie along x"),
+        ({"turned": True}, r"starts at \(-11.[0-9]+, .*\) m/s, not towards the points ahead, which lie along x"),
         ({"shown": 2}, "shows 2 states; the 13 of its vehicle are right"),
     ],
 )

@@ -253,7 +253,7 @@ def _warnings(answered: Answer, origin: str) -> Iterator[str]:
         yield in_turn(explored.changes)
     unexplained = comparison.unexplained(measured.improvable)
     yield from left_unexplained(comparison, verdict, unexplained)
-    yield from imitating(found, measured.gap, unexplained)
+    yield from imitating(found, measured.gap, comparison.unexplained(False))
     yield from at_bounds(comparison, found, explored.effects)
     bare = comparison.unchanged
     yield from shown_by_episodes(comparison, verdict, unexplained)

@@ -142,7 +142,8 @@ def in_turn(changes: Sequence[Changing]) -> str:
     first = changes[0]
     if first.files:
         return f"{CHANGES_BETWEEN}: {listed(first.files)}, in this order, are explained by {listed(sets, 'or')}"
-    start = f"from {', '.join(number(each) for each in first.starts)} s on" if first.starts else "one after the other"
+    starts = ", ".join(number(each) for each in first.starts)
+    start = f"from about {starts} s on" if starts else "one after the other"
     return f"{CHANGES}: {len(first.values)} stretches of it, {start}, are explained by {listed(sets, 'or')}"
 
 

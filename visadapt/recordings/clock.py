@@ -83,7 +83,7 @@ class RawEpisode:
     """(T, n_measured) which readings are measurements; without it, all are"""
     command_period: float | None = None
     """median s between commands that had stamps of their own, of which a row holds the mean until the next; None of
-    commands without"""
+    commands without, or sent once"""
 
     @property
     def origin(self) -> str:

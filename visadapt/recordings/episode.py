@@ -124,7 +124,7 @@ class Recording:
     """smallest meaningful difference of each measured state; without it, the smallest between two of its readings"""
     command_period: float | None = None
     """median s between commands that had stamps of their own, of which a row holds the mean until the next; None of
-    commands without"""
+    commands without, or sent once"""
 
     def __post_init__(self) -> None:
         if not self.episodes:

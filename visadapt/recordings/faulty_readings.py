@@ -133,7 +133,9 @@ def _outages(raw: RawEpisode, system: System) -> Iterator[tuple[int, int]]:
     positions = [raw.measured.index(name) for name in raw.measured if system.rate_of(name) is not None]
     if not positions or (len(raw.measured) == 1 and _may_stand_still(variable_of(system, raw.measured[0]), system)):
         return
-    steps, least = _steps(np.diff(raw.state[:, positions], axis=0))
+    angles = [variable_of(system, raw.measured[column]).unit == "rad" for column in positions]
+    changes = [differences(raw.state[:, column], angle) for column, angle in zip(positions, angles, strict=True)]
+    steps, least = _steps(np.column_stack(changes))
     repeated = np.append(False, (raw.state[1:] == raw.state[:-1]).all(1))
     for start, end in runs((~repeated).cumsum()):
         others = (repeated.sum() - (end - start - 1) + 1) / len(repeated)

@@ -146,7 +146,7 @@ class _Log:
     @property
     def command_period(self) -> float | None:
         """Median s between the slowest commands; None where they have the stamps of readings, or one was sent once."""
-        stamps = [self.topics[name].time for name in self.of_actions if name not in self.of_states]
+        stamps = [np.unique(self.topics[name].time) for name in self.of_actions if name not in self.of_states]
         if len(stamps) < len(self.of_actions) or any(len(each) < 2 for each in stamps):
             return None
         return max(float(np.median(np.diff(each))) for each in stamps)

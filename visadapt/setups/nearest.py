@@ -33,7 +33,8 @@ def keep_nearest(found: Diagnosis, path: Path) -> None:
     )
     values = {cause.effect: {name: one.value for name, one in cause.parameters.items()} for cause in causes}
     known = all(math.isfinite(value) for each in values.values() for value in each.values())
-    if found.verdict == UNEXPLAINED and kinds and steady and known and found.gap.closed >= WORTH_USING:
+    closed = causes[0].gap_closed if len(causes) == 1 else found.gap.closed
+    if found.verdict == UNEXPLAINED and kinds and steady and known and closed >= WORTH_USING:
         write_json(_beside(path), values)
 
 

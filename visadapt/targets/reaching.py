@@ -18,7 +18,7 @@ class ReachingTarget(GoalTarget):
         task: where the points are; without it, 50 m ahead.
 
     Raises:
-        TargetError: `reset` starts more than a metre from the origin, or in flight away from a point.
+        TargetError: `reset` starts more than a metre from the origin, or not in flight towards a point.
 
     >>> import torch, visadapt as va
     >>> class Rig(va.Target):
@@ -46,7 +46,7 @@ class ReachingTarget(GoalTarget):
         if not bool(ahead.all()):
             x, y, z = seen.state[~ahead][0, VELOCITY].tolist()
             raise TargetError(
-                f"{self.name}: starts at ({x:.3g}, {y:.3g}, {z:.3g}) m/s, away from the points ahead, which lie along "
-                "x: an x axis along which flights start is right"
+                f"{self.name}: starts at ({x:.3g}, {y:.3g}, {z:.3g}) m/s, not towards the points ahead, which lie "
+                "along x: an x axis along which flights start is right"
             )
         return seen

@@ -32,7 +32,8 @@ def best_on_all_rows(
 
     # The states of a source that is far off are far off too: a fit from there may fall behind before it comes near.
     whole.fit(starts(close[:1]), effort, to_the_end=True)
-    whole.explains_all(whole.best)  # so that the others start from states at which its joints do come to rest
+    if len(close) > 1:
+        whole.fit_at_rest(whole.best)  # the others start from its states
     whole.fit(starts(close[1:]), FINAL)
     whole.exchange_in_rejected()
     return whole

@@ -191,9 +191,16 @@ class FittedModels:
                 self._keep(each.effects, fits)
         return out
 
+    def fit_at_rest(self, found: ScoredModel) -> None:
+        """Fit a set with dry friction from states at which its joints come to rest, to which the usual fit may not have
+        come; that fit is kept if it is clearly better."""
+        if _rubs(found):
+            self._quiet([found])
+
     def _at_rest(self, found: ScoredModel) -> FitState:
-        """The fit of a set with the states that are most probable without process noise, where joints come to rest."""
-        if not any(issubclass(effect, DynamicsEffect) and effect.rubs() for effect in found.effects):
+        """The fit of a set with dry friction with the states that are most probable without process noise; of another
+        set, as it is."""
+        if self.rows.colour is not None or not _rubs(found):
             return found.fits
         model = CandidateModel(self.system, found.effects, self.rows, CAREFUL[1])
         least = torch.full_like(found.fits.log_process, min_log_process(self.rows.period))
@@ -246,6 +253,11 @@ class FittedModels:
         if key not in self.fitted or _is_better(fitted, self.fitted[key]):
             self.fitted[key] = fitted
         return self.fitted[key]
+
+
+def _rubs(found: ScoredModel) -> bool:
+    """Whether a set brings dry friction."""
+    return any(issubclass(effect, DynamicsEffect) and effect.rubs() for effect in found.effects)
 
 
 def _is_better(one: ScoredModel, other: ScoredModel) -> bool:

@@ -28,8 +28,8 @@ SHORTEST, SHORTEST_AT_END = 1.5, 1.0
 SLOW = 0.3  # Acceleration of a joint that stands still, over that by the load that would hold it, at most
 STILL = 0.1  # Prediction times in which that load would give it the speed that it has, at most
 SLOWER = 0.3
-"""Mean speed in a stretch over the median elsewhere, at most: a joint that balances another body, of a mass that is not
-known, is as fast as ever."""
+"""Mean speed in a stretch over the median elsewhere, of what is not much slower, at most: a joint that balances another
+body, whose mass is not the simulator's, keeps its usual speed."""
 LONGEST_GAP = 0.2  # Prediction times for which a joint may look moved while it is held, as where its load passes zero
 MUCH = 3.0
 """Load that holds a joint, over its dry friction and over what is left unexplained elsewhere, at least."""

@@ -209,12 +209,12 @@ def rollout_errors(
     if black_box is not None:
         fits = replace(fits, log_process=black_box.fits.log_process)
 
-    def driven(model: CandidateModel, fits: FitState, problem: Linear) -> Linear:
+    def with_black_box(model: CandidateModel, fits: FitState, problem: Linear) -> Linear:
         assert black_box is not None
         loads = black_box.loads(inputs(model, fits.state[0])[:, :-1, None]) * model.rows.inside[:, 1:, None, None]
         return replace(problem, drive=problem.drive + (loads_of(model, fits) * loads).sum(-1, keepdim=True))
 
-    estimated = smoothed_states(model, fits, None if black_box is None else driven)
+    estimated = smoothed_states(model, fits, None if black_box is None else with_black_box)
     predicted = _rollouts(model, fits.theta[0], estimated, horizon, stride, black_box)
 
     measured, shown = model.shown(fits.theta[0])
