@@ -176,6 +176,7 @@ COMMANDS = (
         20,
         work="--work",
     ),
+    Command("sticking", "sticking.csv", ("benchmarks.sticking",), 5, work="--work"),
     Command("vibrations", "vibrations.csv", ("benchmarks.vibrations", "--seeds", "2"), 10, work="--work"),
     Command(
         "baselines",

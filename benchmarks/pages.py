@@ -83,6 +83,7 @@ TABLES = {
     "blind frames": Table(diagnosis.blind_frames, ("blind_frames",)),
     "blind flights": Table(diagnosis.blind_flights, ("blind_quadrotor", "blind_fixed_wing")),
     "planned experiments": Table(diagnosis.planned, ("planned_experiments",)),
+    "sticking": Table(diagnosis.sticking, ("sticking",)),
     "vibrations": Table(diagnosis.vibrations, ("vibrations",)),
     "rotorpy diagnosis": Table(diagnosis.crazyflie, ("rotorpy_diagnosis",)),
     "baselines, constant": Table(paper.baselines_constant, ("baselines",)),

@@ -142,6 +142,18 @@ def vibrations(rows: Rows) -> Lines:
     return lines
 
 
+def sticking(rows: Rows) -> Lines:
+    """A ball that dry friction stops, with and without what the diagnosis does about that."""
+    found = {(row["method"], row["measure"]): float(row["mean"] or "nan") for row in rows}
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    units = {row["measure"]: row["unit"] for row in rows}
+    lines = [[f"ball that dry friction stops, {rows[0]['episodes']} recordings", *methods]]
+    for measure, unit in units.items():
+        numbers = [found[method, measure] for method in methods]
+        lines.append([measure, *(f"{x:.2f}" if unit == "1" else f"{100 * x:.3g} %" for x in numbers)])
+    return lines
+
+
 def _check(rows: Rows, kinds: tuple[str, ...]) -> Lines:
     """The header, and one line a measure: its key, its name, and a cell for every diagnoser on every set."""
     found = {(row["kind"], row["diagnoser"], row["measure"]): row for row in rows}

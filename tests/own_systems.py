@@ -183,30 +183,3 @@ class Rover(System):
         torque = torque + self.half_track * (right - left) - self.damping * self.half_track**2 * yaw_rate
         rates = (speed * yaw.cos(), speed * yaw.sin(), yaw_rate, force / self.mass, torque / self.inertia)
         return torch.stack(rates, -1)
-
-
-@dataclass(frozen=True)
-class BallBeam(System):
-    """A ball rolls on a beam, which a motor tilts about its middle."""
-
-    ball_mass: float | torch.Tensor = 0.11  # kg
-    beam_inertia: float | torch.Tensor = 0.02  # kg m2
-    gravity: float | torch.Tensor = 9.81
-
-    name = "ball_beam"
-    states: ClassVar[tuple[Variable, ...]] = (
-        Variable("ball", "m", -0.45, 0.45),
-        Variable("beam", "rad", -0.6, 0.6),
-        Variable("ball_rate", "m/s", -2.0, 2.0),
-        Variable("beam_rate", "rad/s", -6.0, 6.0),
-    )
-    actions: ClassVar[tuple[Variable, ...]] = (Variable("torque", "N m", -1.0, 1.0),)
-    loads = (Variable("track", "N", -0.3, 0.3), Variable("axle", "N m", -0.3, 0.3))
-    coordinates = ((0, 2), (1, 3))
-
-    def derivative(self, state, command, load):
-        ball, beam, rate, turn = state.unbind(-1)
-        mass = self.ball_mass
-        rolls = (mass * (ball * turn**2 - self.gravity * beam.sin()) + load[:, 0]) / (1.4 * mass)
-        torque = command[:, 0] + load[:, 1] - mass * self.gravity * ball * beam.cos() - 2 * mass * ball * rate * turn
-        return torch.stack((rate, turn, rolls, torque / (self.beam_inertia + mass * ball**2)), -1)

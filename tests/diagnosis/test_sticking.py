@@ -2,9 +2,10 @@
 
 import pytest
 
-from tests.ball_beam import PERIOD, balanced, to_and_fro
-from tests.own_systems import BallBeam
+from experiments.ball_beam import PERIOD, BallBeam, balanced, to_and_fro
 from visadapt.diagnosis import diagnose
+from visadapt.diagnosis.search.preparation import prepare
+from visadapt.diagnosis.search.search import Search
 from visadapt.effects.catalogue import catalogue
 from visadapt.world import World
 
@@ -12,14 +13,13 @@ BY_NAME = {effect.name: effect for effect in catalogue(BallBeam())}
 CATALOGUE = [BY_NAME[f"track.{name}"] for name in ("coulomb_friction", "directional_friction")]
 
 
-def test_the_states_from_which_predictions_start_are_those_of_a_ball_that_stops():
-    # Where the ball is taken to roll though it rests, it is soon elsewhere, and tilts the beam.
-    friction = BY_NAME["track.coulomb_friction"](force=0.015)
-    recording, _ = balanced([friction], 2, 1500, lambda time: to_and_fro(time + 0.714))
-    found = diagnose(recording, World(BallBeam(), (), PERIOD), CATALOGUE)
-    assert (found.verdict, [cause.effect for cause in found.causes]) == ("identified", ["track.coulomb_friction"])
-    assert found.causes[0].parameters["force"].value == pytest.approx(0.015, rel=0.01)
-    assert found.gap.after < 1.2 * found.gap.floor
+def test_a_fit_from_states_at_which_the_ball_rests_is_likelier():
+    friction = BY_NAME["track.coulomb_friction"]
+    recording, _ = balanced([friction(force=0.015)], 4, 900, lambda time: to_and_fro(time + 3.6))
+    search = Search(BallBeam(), prepare(recording, BallBeam(), [friction]).rows, [friction])
+    before = search.single(friction)
+    search.fit_at_rest(before)
+    assert float(search.single(friction).fits.likelihood[0] - before.fits.likelihood[0]) > 5
 
 
 def test_a_beam_that_balances_a_ball_of_another_mass_is_not_held():

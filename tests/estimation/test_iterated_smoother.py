@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import torch
 
-from tests.ball_beam import balanced, to_and_fro
-from tests.own_systems import BallBeam
+from experiments.ball_beam import BallBeam, balanced, to_and_fro
 from visadapt.diagnosis.search.preparation import prepare
 from visadapt.diagnosis.search.search import Search
 from visadapt.effects.catalogue import catalogue

@@ -37,6 +37,10 @@ START_SPACING = 0.04
 """Share of the prediction time between the starts of predictions, where rows follow each other faster; they then hardly
 differ."""
 
+UNKNOWN = 0.2
+"""Share of the prediction time from the first row of a window on in which no prediction starts: states there are
+estimated without earlier readings, and where a joint sticks, later ones do not show its velocity."""
+
 BLACK_BOX_ROWS = 1600  # Rows to which a black box is fitted: windows spread evenly over the recording
 
 STATE_LIMIT = 1e3
@@ -218,9 +222,8 @@ def rollout_errors(
     predicted = _rollouts(model, fits.theta[0], estimated, horizon, stride, black_box)
 
     measured, shown = model.shown(fits.theta[0])
-    # Predictions from the first row of a window are left out if the window is long enough: that state is estimated
-    # without earlier readings, and where a joint sticks, later ones do not show its velocity.
-    others = rows.inside.sum(1) > horizon + stride
+    unknown = max(1, math.ceil(UNKNOWN * horizon / stride - 1e-9))
+    others = rows.inside.sum(1) > horizon + unknown * stride  # windows that are long enough
     left = model.measure(fits.theta[0], estimated) - measured
     # Rows in which the predictions of each horizon end, read all at once: late sensors take a simulation to read.
     every_end = [torch.arange(h, length, stride) for h in range(horizon + 1)]
@@ -231,7 +234,7 @@ def rollout_errors(
     for ends, read in zip(every_end, readings, strict=True):
         used = shown[:, ends].clone()
         if used.shape[1]:
-            used[others, 0] = 0
+            used[others, :unknown] = 0
         every = (read - measured[:, ends]) * used, used, read, left[:, ends] * used
         # Predictions that would end beyond the window are not valid.
         parts.append([pad(x, (0, 0, 0, predicted.shape[1] - x.shape[1])) for x in every])
