@@ -31,7 +31,11 @@ def best_on_all_rows(
         return [(each.effects, replace(each.fits, state=whole.best.fits.state)) for each in group]
 
     # The states of a source that is far off are far off too: a fit from there may fall behind before it comes near.
-    whole.fit(starts(close[:1]), effort, to_the_end=True)
+    (found,) = whole.fit(starts(close[:1]), effort, to_the_end=True) or [whole.source]
+    if found.fits.likelihood < whole.source.fits.likelihood:
+        # Its states are far off for the little process noise that it had on the rows searched.
+        noisier = replace(found.fits, state=whole.source.fits.state, log_process=whole.source.fits.log_process)
+        whole.fit([(found.effects, noisier)], effort, to_the_end=True)
     if len(close) > 1:
         whole.fit_at_rest(whole.best)  # the others start from its states
     whole.fit(starts(close[1:]), FINAL)
