@@ -82,8 +82,8 @@ class RawEpisode:
     usable: NDArray[np.bool_] | None = None
     """(T, n_measured) which readings are measurements; without it, all are"""
     command_period: float | None = None
-    """median s between commands that had stamps of their own, of which a row holds the mean until the next; None of
-    commands without, or sent once"""
+    """median s between commands with stamps of their own, of which a row holds the mean until the next; None where they
+    share those of readings, or one was sent but once"""
 
     @property
     def origin(self) -> str:

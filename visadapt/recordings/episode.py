@@ -123,8 +123,8 @@ class Recording:
     resolution: tuple[float, ...] = ()
     """smallest meaningful difference of each measured state; without it, the smallest between two of its readings"""
     command_period: float | None = None
-    """median s between commands that had stamps of their own, of which a row holds the mean until the next; None of
-    commands without, or sent once"""
+    """median s between commands with stamps of their own, of which a row holds the mean until the next; None where they
+    share those of readings, or one was sent but once"""
 
     def __post_init__(self) -> None:
         if not self.episodes:
