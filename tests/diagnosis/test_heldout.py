@@ -41,6 +41,7 @@ def test_a_window_starts_no_prediction_with_its_first_state_unless_it_has_no_oth
     errors = rollout_errors(CandidateModel(CartPole(), [], cut), Search(CartPole(), cut, []).source.fits, 10)
     starts = errors.valid[-1].sum((0, 2)) > 0
     assert bool(starts[0]) == first_is_used
+    assert starts[:2].any() == (rows < 60)  # of 10 rows, where there are others, none starts in the first two
     assert starts.any()
 
 

@@ -223,7 +223,8 @@ def rollout_errors(
 
     measured, shown = model.shown(fits.theta[0])
     unknown = max(1, math.ceil(UNKNOWN * horizon / stride - 1e-9))
-    others = rows.inside.sum(1) > horizon + unknown * stride  # windows that are long enough
+    later = (rows.inside.sum(1) - 1 - horizon).div(stride, rounding_mode="floor")  # starts after the first, by window
+    left_out = torch.arange(unknown) < later[:, None]
     left = model.measure(fits.theta[0], estimated) - measured
     # Rows in which the predictions of each horizon end, read all at once: late sensors take a simulation to read.
     every_end = [torch.arange(h, length, stride) for h in range(horizon + 1)]
@@ -234,7 +235,7 @@ def rollout_errors(
     for ends, read in zip(every_end, readings, strict=True):
         used = shown[:, ends].clone()
         if used.shape[1]:
-            used[others, :unknown] = 0
+            used[:, :unknown][left_out[:, : used.shape[1]]] = 0
         every = (read - measured[:, ends]) * used, used, read, left[:, ends] * used
         # Predictions that would end beyond the window are not valid.
         parts.append([pad(x, (0, 0, 0, predicted.shape[1] - x.shape[1])) for x in every])
