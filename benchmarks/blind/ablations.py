@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -17,11 +18,11 @@ from visadapt.diagnosis.search import heldout, search
 from visadapt.diagnosis.search.fitted_models import MIN_LEFTOVER, FittedModels, ScoredModel, less
 from visadapt.diagnosis.search.model_comparison import ModelComparison
 from visadapt.diagnosis.search.search import TWO_FOR_ONE_UP_TO, Exchanges, Search
+from visadapt.estimation import iterated_smoother
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.fit_states import QUICK, Effects
 from visadapt.estimation.iterated_smoother import AddLoads
-from visadapt.estimation.kalman import backward, forward
-from visadapt.estimation.likelihood import FitState, linear_problem, variances
+from visadapt.estimation.likelihood import FitState
 
 EXPLORATION = import_module("visadapt.diagnosis.exploration")
 """The module; as an attribute of its package, the name is that of the function."""
@@ -97,10 +98,8 @@ def _fit_with_noise(self: Search, starts: Sequence[tuple[Effects, FitState]], ef
 
 def _smoothed_once(model: CandidateModel, fits: FitState, add_loads: AddLoads | None) -> Tensor:
     """The states (W, T, n) after one linear step."""
-    problem = linear_problem([model], fits).data()
-    problem = problem if add_loads is None else add_loads(model, fits, problem)
-    step = backward(forward(problem, *variances(model, fits, problem)))[0][..., 0]
-    return fits.state[0] + step.nan_to_num(0, 0, 0)
+    with patch.object(iterated_smoother, "LARGEST_UNVERIFIED", math.inf):
+        return iterated_smoother.smoothed_states(model, fits, add_loads)
 
 
 def _verifies(out: Tensor, *given: Any) -> bool:

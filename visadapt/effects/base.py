@@ -167,6 +167,11 @@ class Effect(nn.Module):
         return made
 
     @classmethod
+    def rubs(cls) -> bool:
+        """Whether it is, or brings, dry friction."""
+        return False
+
+    @classmethod
     def region(cls) -> tuple[Parameter, Parameter] | None:
         """The parameters at which the region that it acts in starts and ends; None where it acts everywhere."""
         edges = {parameter.role: parameter for parameter in cls.table if parameter.is_edge}

@@ -117,7 +117,7 @@ class CandidateModel:
         """columns of the parameters that change what acts of the commands"""
         self.reads_commands = self._world.reads_commands
         self._late = [(k, effect.late) for k, effect in enumerate(owners) if issubclass(effect, LateSensors)]
-        rubs = any(issubclass(effect, DynamicsEffect) and effect.rubs() for effect in effects)
+        rubs = any(effect.rubs() for effect in effects)
         self.feels_unmodelled_loads = rows.colour is not None and rubs
         """whether what is missing from the model decides which way friction acts"""
         self._phase_columns = phase_columns(effects, len(rows.command))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from visadapt.effects import DynamicsEffect, Effect
+from visadapt.effects import Effect
 from visadapt.estimation.linearise import linearise_step
 from visadapt.history import HORIZON
 from visadapt.policies import Policy
@@ -25,7 +25,7 @@ def initialise_feedforward(policy: Policy, source: World, scale: Tensor) -> None
     policy reads.
     """
     effects = [effect for effect in source.effects if isinstance(effect, Effect)]
-    source = source.with_effects([e for e in effects if not (isinstance(e, DynamicsEffect) and e.rubs())])
+    source = source.with_effects([e for e in effects if not e.rubs()])
     rest = torch.zeros(1, policy.n_state, dtype=torch.float64)
     no_command = rest.new_zeros(1, source.substeps, policy.n_action)
     with torch.no_grad():

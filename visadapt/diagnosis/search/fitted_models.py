@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from visadapt.diagnosis.search.model_evidence import log_posterior_odds
-from visadapt.effects import DynamicsEffect, Effect
+from visadapt.effects import Effect
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.fit_states import (
     CAREFUL,
@@ -257,7 +257,7 @@ class FittedModels:
 
 def _rubs(found: ScoredModel) -> bool:
     """Whether a set brings dry friction."""
-    return any(issubclass(effect, DynamicsEffect) and effect.rubs() for effect in found.effects)
+    return any(effect.rubs() for effect in found.effects)
 
 
 def _is_better(one: ScoredModel, other: ScoredModel) -> bool:

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv1d, pad
 
-from visadapt.effects import DynamicsEffect, Effect
+from visadapt.effects import Effect
 from visadapt.recordings import Episode
 from visadapt.world import World, WorldState
 
@@ -80,7 +80,7 @@ class Motion:
     def without_dry_friction(self) -> Motion:
         """The same motion in a world without dry friction, whose load jumps where a joint turns round."""
         named = [effect for effect in self.world.effects if isinstance(effect, Effect)]
-        kept = [effect for effect in named if not (isinstance(effect, DynamicsEffect) and effect.rubs())]
+        kept = [effect for effect in named if not effect.rubs()]
         return replace(self, world=self.world.with_effects(kept))
 
     @cached_property
