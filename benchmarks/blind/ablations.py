@@ -17,7 +17,7 @@ from torch import Tensor
 from visadapt.diagnosis.search import heldout, search
 from visadapt.diagnosis.search.fitted_models import MIN_LEFTOVER, FittedModels, ScoredModel, less
 from visadapt.diagnosis.search.model_comparison import ModelComparison
-from visadapt.diagnosis.search.search import TWO_FOR_ONE_UP_TO, Exchanges, Search
+from visadapt.diagnosis.search.search import SMALL_SET, Exchanges, Search
 from visadapt.estimation import iterated_smoother
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.fit_states import QUICK, Effects
@@ -88,7 +88,7 @@ def _remove_only(self: Search, centre: ScoredModel, exchanged: Exchanges) -> Non
 
 
 def _one_for_one_only(self: Search, centre: ScoredModel, exchanged: Exchanges) -> None:
-    with patch.object(search, "TWO_FOR_ONE_UP_TO", 0):
+    with patch.object(search, "_pairs", lambda effects: ()):
         _fit_neighbours(self, centre, exchanged)
 
 
@@ -121,7 +121,7 @@ PARTS = {
         Search,
         "_fit_neighbours",
         _one_for_one_only,
-        lambda _, self, centre, made: 2 <= len(centre.effects) <= TWO_FOR_ONE_UP_TO,
+        lambda _, self, centre, made: 2 <= len(centre.effects) <= SMALL_SET,
     ),
     "careful fits": Part(Search, "_polish", _nothing),
     "starts without process noise": Part(Search, "_fit_from_quiet", _fit_with_noise),

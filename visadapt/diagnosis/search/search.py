@@ -9,7 +9,7 @@ near it grow further.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from copy import copy
 from dataclasses import replace
 from itertools import combinations
@@ -35,9 +35,9 @@ TIED, MAX_TIED = 1.0, 8
 tried at most: where one of them is fitted, all are. Of a shaft that turns one way, dry friction, a bias of the motor
 and a constant load do the same."""
 
-TWO_FOR_ONE_UP_TO = 4
-"""Effects at most in a set of which two are exchanged for one. Larger sets describe something that no effect explains;
-their many pairs would take most of the search."""
+SMALL_SET = 4
+"""Effects at most in a set of which effects are exchanged. Larger sets describe something that no effect explains: what
+exchanges find there is another imitation of it, and they would take most of the search."""
 
 MAX_ROUNDS = 3  # In which the best set is exchanged for one that has as many effects, or more
 
@@ -173,7 +173,7 @@ class Search(FittedModels):
     def _worth_extending(self, ranked: Sequence[ScoredModel]) -> list[ScoredModel]:
         """The best of sets of one size, the most probable first, that may lead to a better one: not those that gain
         nothing by having more parameters than another and, where the best explains all, not those far behind."""
-        beam = ranked[: self.profile.beam_width]
+        beam = ranked[: self.profile.beam_width if len(ranked[0].effects) < SMALL_SET else 1]
         if self.explains_all(beam[0]):
             beam = [each for each in beam if each.log_odds > beam[0].log_odds - OUT_OF_REACH]
         return [each for each in beam if not any(_imitates(each, other) for other in beam)]
@@ -304,13 +304,12 @@ class Search(FittedModels):
         return [one for one in screened if one.gain >= required(one)]
 
     def _fit_neighbours(self, centre: ScoredModel, exchanged: Exchanges) -> None:
-        """Fit the sets with one effect removed, with one exchanged for another, and with two exchanged for one, but
-        for exchanges made before."""
+        """Fit the sets with one effect removed and, of a set of at most SMALL_SET effects, with one exchanged for
+        another, and with two exchanged for one, but for exchanges made before."""
         # Also sets that were fitted before: from the larger set's parameters a fit may reach a better optimum.
         self.fit([less(centre, [removed]) for removed in centre.effects], QUICK)
         exchanges, slow = [], []
-        pairs = combinations(centre.effects, 2) if len(centre.effects) <= TWO_FOR_ONE_UP_TO else ()
-        for removed in (*combinations(centre.effects, 1), *pairs):
+        for removed in (*combinations(centre.effects, 1), *_pairs(centre.effects)):
             # Along the states of the whole set a removed effect shows as a disturbance, without a fit of the rest.
             kept, fits = less(centre, removed)
             if key_of(kept) in exchanged:
@@ -318,6 +317,8 @@ class Search(FittedModels):
             exchanged.add(key_of(kept))
             if any(follows_late(effect, self.system) for effect in removed):
                 slow.append((kept, fits))
+            if len(centre.effects) > SMALL_SET:
+                continue
             rest = [e for e in self.catalogue if e not in centre.effects]
             screened = screen(self.system, kept, fits, self.rows, rest, self.jobs)
             for candidate in _leading(self._promising(screened), MAX_EXCHANGES):
@@ -369,6 +370,11 @@ def _imitates(one: ScoredModel, other: ScoredModel) -> bool:
     where it does not differ."""
     more = one.fits.theta.shape[1] - other.fits.theta.shape[1]
     return more > 0 and float(one.fits.likelihood[0] - other.fits.likelihood[0]) < more
+
+
+def _pairs(effects: Effects) -> Iterable[tuple[type[Effect], ...]]:
+    """The pairs of effects that are exchanged for one."""
+    return combinations(effects, 2) if len(effects) <= SMALL_SET else ()
 
 
 def _is_delay(effect: type[Effect]) -> bool:
