@@ -3,7 +3,7 @@
 Sets grow from the source and from every effect alone. Those near the best are then tried: with one effect fewer, with
 one exchanged, and, if they are small, with two exchanged for one, since two effects often imitate a third (a weaker
 motor and a lighter pole, a heavier cart). Where a set explains all, so that process noise adds nothing to it, only sets
-near it grow further.
+near it grow further. Sets of more than SMALL_SET effects grow one at a time, and nothing of them is exchanged.
 """
 
 from __future__ import annotations
