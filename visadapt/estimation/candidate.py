@@ -129,6 +129,10 @@ class CandidateModel:
         """(W, T - 1, n, L) how process noise enters the states; see `unmodelled_loads`."""
         return noise_directions(self.rows, self.system)
 
+    def on(self, windows: Tensor) -> CandidateModel:
+        """The same set along these windows, by index."""
+        return CandidateModel(self.system, self.effects, self.rows.select(windows), self.accuracy)
+
     def at(self, theta: Tensor) -> World:
         """The world with parameters (P,), or (N, P) for a batch of N states; `by_row` gives those of rows."""
         return self._world.with_values(theta)

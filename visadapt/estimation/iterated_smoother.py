@@ -62,8 +62,7 @@ def _verify(
             model.slopes = None
             tried = _Linearised.along(model, fits, state.index_copy(0, unsure, best.state + step), add_loads)[unsure]
         else:
-            subset = CandidateModel(model.system, model.effects, model.rows.select(unsure), model.accuracy)
-            tried = _Linearised.along(subset, fits.on(unsure), best.state + step, add_loads)
+            tried = _Linearised.along(model.on(unsure), fits.on(unsure), best.state + step, add_loads)
         better = tried.cost < best.cost
         best, damping = tried.where(better, best), torch.where(better, damping / 10, damping * 10)
         state[unsure] = best.state

@@ -173,24 +173,20 @@ def _of_folds(
     """The windows of some folds, and their predictions by a set that is refitted without them."""
     out = folds(rows, profile_of(system).folds)
     used = 1 - out if len(out) > 1 else torch.ones_like(out)
-    without = refitted(CandidateModel(system, effects, rows, COARSE), fits, used)
-
-    def on(fold: int, windows: Tensor) -> tuple[CandidateModel, FitState]:
-        one = without[torch.tensor([fold])]
-        model = CandidateModel(system, effects, rows.select(windows), COARSE)
-        return model, one.on(windows)
-
+    model = CandidateModel(system, effects, rows, COARSE)
+    without = refitted(model, fits, used)
     # Episodes may be shorter than the time of a prediction.
     horizon = max(1, min(round(system.prediction_time / rows.period), int(rows.inside.sum(1).max()) - 1))
     parts, stride = [], _stride(system, rows)
     for k in indices:
-        box = None
+        box, refit = None, without[torch.tensor([k])]
         if black_box:
             others = used[k].nonzero()[:, 0]
+            some = others[rows.select(others).spread(BLACK_BOX_ROWS)]
             with suppress(torch.linalg.LinAlgError):  # type: ignore[attr-defined]  # then nothing is predicted better than without it
-                box = fit_black_box(*on(k, others[rows.select(others).spread(BLACK_BOX_ROWS)]))
+                box = fit_black_box(model.on(some), refit.on(some))
         held = out[k].nonzero()[:, 0]
-        parts.append((held, rollout_errors(*on(k, held), horizon, stride, box)))
+        parts.append((held, rollout_errors(model.on(held), refit.on(held), horizon, stride, box)))
     return parts
 
 
