@@ -1,9 +1,9 @@
 """The search over sets of effects: add, remove and exchange effects while that raises the posterior odds.
 
-Sets grow from the source and from every effect alone. Those near the best are then tried: with one effect fewer, with
-one exchanged, and, if they are small, with two exchanged for one, since two effects often imitate a third (a weaker
+Sets grow from the source and from every effect alone. Those near the best are then tried: with one effect fewer and, if
+they are small, with one exchanged, and with two exchanged for one, since two effects often imitate a third (a weaker
 motor and a lighter pole, a heavier cart). Where a set explains all, so that process noise adds nothing to it, only sets
-near it grow further. Sets of more than SMALL_SET effects grow one at a time, and nothing of them is exchanged.
+near it grow further. From SMALL_SET effects on, only the best set of a size grows.
 """
 
 from __future__ import annotations
@@ -36,8 +36,9 @@ tried at most: where one of them is fitted, all are. Of a shaft that turns one w
 and a constant load do the same."""
 
 SMALL_SET = 4
-"""Effects at most in a set of which effects are exchanged. Larger sets describe something that no effect explains: what
-exchanges find there is another imitation of it, and they would take most of the search."""
+"""Effects at most in a set of which effects are exchanged, and from which on only the best set of a size grows. Larger
+sets describe something that no effect explains: what a wider search finds there is another imitation of it, and would
+take most of the time."""
 
 MAX_ROUNDS = 3  # In which the best set is exchanged for one that has as many effects, or more
 
