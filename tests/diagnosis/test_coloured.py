@@ -9,6 +9,7 @@ from visadapt import diagnose
 from visadapt.diagnosis.search.coloured import colour_left_by
 from visadapt.diagnosis.search.preparation import prepare
 from visadapt.diagnosis.search.search import Search
+from visadapt.diagnosis.words import LASTING
 from visadapt.effects import ActuatorGain, CoulombFriction, PeriodicForce, ViscousFriction
 from visadapt.estimation.candidate import CandidateModel
 from visadapt.estimation.fitting import fit
@@ -24,6 +25,7 @@ def test_friction_is_found_with_its_size_beside_a_vibration():
     recording = record(effects, rows=150, seed=2, measured=EVERY_STATE, noise=(0.001,) * 4)
     found = diagnose(recording, World(CartPole()), catalogue=[ViscousFriction, ActuatorGain])
     assert found.verdict == "unexplained"
+    assert not any(one.startswith(LASTING) for one in found.warnings)  # a vibration is no error of readings
     assert [cause.effect for cause in found.partial] == ["viscous_friction"]
     coefficient = found.partial[0].parameters["coefficient"]
     assert coefficient.value == pytest.approx(2.0, rel=0.01)

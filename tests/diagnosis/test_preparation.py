@@ -95,6 +95,22 @@ def test_noise_of_few_readings_does_not_make_velocities_late():
     assert late == 0
 
 
+def test_velocities_that_an_estimator_corrects_with_their_positions_are_not_late():
+    generator, time = np.random.default_rng(0), 0.02 * np.arange(500)
+    # Every tenth row, both jump by what a reading of the position is off; in between the velocity is the slope.
+    jumps = np.where(np.arange(500) % 10 == 0, generator.normal(0, 0.01, 500), 0.0)
+    wrong = np.array([0.0, 0.0])
+    errors = []
+    for jump in jumps:
+        wrong = 0.95 * (wrong + np.array([0.02 * wrong[1], 0.0])) + np.array([1.0, 2.0]) * jump
+        errors.append(wrong)
+    x = np.stack((0.3 * np.sin(2 * time), 0.6 * np.cos(2 * time)), 1) + np.array(errors)
+    state = torch.from_numpy(np.concatenate((x, np.zeros((500, 2))), 1))
+    command = torch.zeros(500, 1, dtype=torch.float64)
+    rows = cut([state], [torch.ones(500, 4)], [command], [torch.from_numpy(time)], (0, 1, 2, 3), 0.02, 500)
+    assert "x_dot" not in derived_velocities(CartPole(), rows)
+
+
 def test_whole_episodes_are_in_the_sources_signs_with_lost_readings_filled_in():
     recording = record([ViscousFriction(coefficient=0.8)])
     episodes = []

@@ -77,6 +77,15 @@ def test_an_episode_is_split_where_a_position_is_suddenly_elsewhere(file, run, n
     assert float(by.split()[0]) == pytest.approx(size, abs=0.003)
 
 
+def test_what_an_estimator_corrects_all_the_time_is_left_in_one_piece(file):
+    run = a_run(0.1, 1e-3, rows=3 * ROWS, period=0.02)
+    x = run["x"] + 0.06 * (np.arange(3 * ROWS) // 40 % 2)
+    recording = load(write(file, with_x(run, x)))
+    assert len(recording.episodes) == 1
+    (said,) = (one for one in recording.warnings if "estimator" in one)
+    assert "positions jump in 14 rows" in said
+
+
 def test_a_hit_is_no_jump_of_the_sensor(file, run):
     x = moved(ROWS, 0.02)
     x[100:] += 0.02 * 5.0 * np.arange(100)  # at 5 m/s from one row to the next

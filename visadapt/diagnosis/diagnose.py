@@ -41,6 +41,7 @@ from visadapt.diagnosis.verdict import (
     hovers,
     imitating,
     in_turn,
+    lasting_errors,
     late_by_less_than,
     left_unexplained,
     next_step,
@@ -249,6 +250,8 @@ def _warnings(answered: Answer, origin: str) -> Iterator[str]:
         yield f"{origin}: {TOO_SHORT}"
     if verdict == UNEXPLAINED and explored.apart:
         yield one_by_one(explored.apart)
+    if explored.lasting:
+        yield lasting_errors(explored.lasting)
     if explored.changes:
         yield in_turn(explored.changes)
     unexplained = comparison.unexplained(measured.improvable)

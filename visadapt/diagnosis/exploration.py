@@ -12,6 +12,7 @@ from visadapt.diagnosis.search.apart import ExplainedAlone, explained_apart
 from visadapt.diagnosis.search.causes import Alternative, alternatives
 from visadapt.diagnosis.search.changing import Changing, changing
 from visadapt.diagnosis.search.coloured import colour_left_by, with_coloured_noise
+from visadapt.diagnosis.search.correlated_errors import lasting, with_correlated_errors
 from visadapt.diagnosis.search.draft import PreparedRecording
 from visadapt.diagnosis.search.earlier_commands import without_rows_on_earlier_commands
 from visadapt.diagnosis.search.fitted_models import MIN_LEFTOVER
@@ -40,6 +41,8 @@ class Explored:
     repeats: list[tuple[Cause, float]]  # causes of repeated readings, and the log likelihood lost without them
     apart: tuple[ExplainedAlone, ...]  # recordings that are explained one by one, and not together
     changes: tuple[Changing, ...]  # what explains everything if it changes within the recording, the likeliest first
+    lasting: dict[tuple[str, ...], float]
+    """where errors of readings last for several rows: how long, in s, by the states that one kind of sensor reads"""
 
 
 @dataclass(frozen=True)
@@ -89,17 +92,22 @@ def explore(
     repeats = repeated_reading_causes(prepared, search, comparison, repeating)
     apart: tuple[ExplainedAlone, ...] = ()
     changes: tuple[Changing, ...] = ()
-    if comparison.leftover > MIN_LEFTOVER and not comparison.negligible and not search.rows.jumps:
+    again = staged(progress, "search with correlated errors")
+    correlated = with_correlated_errors(search, comparison, prepared.searched, again)
+    if correlated:
+        search, comparison = correlated
+    elif comparison.leftover > MIN_LEFTOVER and not comparison.negligible and not search.rows.jumps:
         apart = explained_apart(found.some_rows, candidates, recording.sources, progress)
         changes = () if apart else changing(found.some_rows, recording.sources)
-    if not apart and not changes:
+    if not (apart or changes or correlated):
         again = staged(progress, "search with coloured noise")
         search, comparison = with_coloured_noise(search, comparison, prepared.searched, again)
     # Periodic effects may have got a phase for each episode.
     in_use = {effect.name: effect for effect in search.catalogue}
     named = [in_use.get(effect.name, effect) for effect in effects]
     groups = alternatives(comparison, named, system)
-    return Explored(named, prepared, search, comparison, groups, repeats, apart, changes)
+    errors = lasting(search) if correlated else {}
+    return Explored(named, prepared, search, comparison, groups, repeats, apart, changes, errors)
 
 
 def _on_all_rows(search: Search, rows: Segments, progress: Progress | None) -> Search:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 from visadapt.diagnosis import next_experiment
 from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, NO_GAP, UNEXPLAINED, Cause, Gap, without_slight
@@ -16,7 +16,7 @@ from visadapt.diagnosis.search.model_comparison import ModelComparison
 from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.search.sensor_checks import CoarseSteps
 from visadapt.diagnosis.search.unexplained import SmoothFunction, smooth_functions
-from visadapt.diagnosis.words import CHANGES, CHANGES_BETWEEN, ONE_BY_ONE, listed, number, plain, with_unit
+from visadapt.diagnosis.words import CHANGES, CHANGES_BETWEEN, LASTING, ONE_BY_ONE, listed, number, plain, with_unit
 from visadapt.effects import EFFECTS, Effect, Parameter, QuadraticDrag, RotorDrag
 from visadapt.effects.aerial import AirDrag
 from visadapt.estimation.candidate import CandidateModel
@@ -127,6 +127,12 @@ def one_by_one(apart: Sequence[ExplainedAlone]) -> str:
         f"{one.source} by {_with_values(one.best) if one.best.effects else 'the unchanged simulator'}" for one in apart
     )
     return f"{ONE_BY_ONE}: {'; '.join(each)}"
+
+
+def lasting_errors(seconds: Mapping[tuple[str, ...], float]) -> str:
+    """The warning of readings whose errors last for several rows."""
+    each = "; ".join(f"{', '.join(names)} for about {number(each, 2)} s" for names, each in seconds.items())
+    return f"{LASTING}: {each}"
 
 
 def in_turn(changes: Sequence[Changing]) -> str:

@@ -48,6 +48,11 @@ OPPOSITE = " has the opposite sign of the source's"
 DERIVED = "derived from it on the rig, or filtered; left out"
 """What it warns of where it set a velocity aside."""
 
+LASTING = (
+    "errors of readings last, as those of a state estimator do; a gap that is no larger than these errors does not show"
+)
+"""What it warns of where errors of readings are correlated in time, before it says for how long."""
+
 MISFIT = "root mean square of frames less those drawn by the renderer, in grey levels of 255"
 """`Gap.measure` of a film whose motion shows no gap."""
 

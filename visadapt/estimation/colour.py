@@ -91,9 +91,11 @@ def whitened(innovations: Tensor, colour: Colour | None) -> Tensor:
 
 
 def colour_of(
-    innovations: Tensor, inside: Tensor, longest: float, log_process: Tensor, log_noise: Tensor
+    innovations: Tensor, inside: Tensor, longest: float, log_process: Tensor, log_noise: Tensor, own: bool = False
 ) -> Colour | None:
     """The colour of a filter's whitened innovations (N, T, m), `inside` (N, T) its windows; None where they are white.
+
+    With `own`, each channel follows its own past alone.
 
     The order, `longest` at most, is the one with the largest log likelihood less the number of coefficients (Akaike
     1974, IEEE Transactions on Automatic Control 19(6)). `log_process` (G,) and `log_noise` (m,) are the noise of the
@@ -109,12 +111,13 @@ def colour_of(
     white = _log_likelihood(now)
     best: tuple[float, Colour | None] = MIN_GAIN, None
     for order in orders:
-        if order * channels**2 * READINGS_PER_COEFFICIENT > now.numel():
+        count = order * channels * (1 if own else channels)
+        if count * READINGS_PER_COEFFICIENT > now.numel():
             break
         past = torch.cat([innovations[:, first - k : innovations.shape[1] - k] for k in range(1, order + 1)], -1)[here]
-        weights = torch.linalg.lstsq(past, now, driver="gelsd").solution
+        weights = _by_own_past(past, now) if own else torch.linalg.lstsq(past, now, driver="gelsd").solution
         left = now - past @ weights
-        gain = _log_likelihood(left) - white - order * channels**2
+        gain = _log_likelihood(left) - white - count
         if gain > best[0]:
             root = torch.linalg.cholesky(left.T @ left / len(left))
             coefficients = weights.unflatten(0, (order, channels)).mT
@@ -122,6 +125,14 @@ def colour_of(
             start = torch.linalg.cholesky(together.T @ together / len(together))
             best = gain, Colour(coefficients, torch.linalg.inv(root), torch.linalg.inv(start), log_process, log_noise)
     return best[1]
+
+
+def _by_own_past(past: Tensor, now: Tensor) -> Tensor:
+    """(p m, m) least-squares weights of the past (N, p m) of channels (N, m), each of which follows its own alone."""
+    channels = now.shape[1]
+    lags = past.unflatten(1, (-1, channels)).movedim(2, 0)  # (m, N, p)
+    weights = torch.linalg.lstsq(lags, now.T[..., None], driver="gelsd").solution[..., 0]  # (m, p)
+    return torch.diag_embed(weights.T).flatten(0, 1)
 
 
 def _log_likelihood(errors: Tensor) -> float:

@@ -160,9 +160,35 @@ def _jumps(steps: NDArray[np.float64], least: NDArray[np.float64]) -> bool:
     return bool((steps[0] > np.maximum(least, STUCK_RATIO * steps[1])).any())
 
 
+FEW_JUMPS, JUMP_SHARE = 5, 0.01
+"""Rows of an episode, and share of all its rows, in which a position may jump for the episode to be split there."""
+
+
 def jumps(raw: RawEpisode, system: System, note: Note) -> list[int]:
-    """The rows from which on a position is suddenly elsewhere: its sensor lost count, or was moved."""
-    out: set[int] = set()
+    """The rows from which on a position is suddenly elsewhere: its sensor lost count, or was moved.
+
+    None where it is so often elsewhere that an estimator, which corrects it with every reading it takes in, wrote it.
+    """
+    found = list(_found_jumps(raw, system))
+    rows = {row for row, _, _ in found}
+    if len(rows) > max(FEW_JUMPS, JUMP_SHARE * len(raw.time)):
+        row, name, size = found[0]
+        note(
+            f"positions jump in {len(rows)} rows, as those of an estimator do where it takes in a reading: the episode "
+            "was not split there",
+            f"{raw.cell(row, name)}, by {size}",
+        )
+        return []
+    for row, name, size in found:
+        note(
+            f"{name} is suddenly elsewhere and stays there: its sensor lost count, or was moved; the episode was split",
+            f"{raw.cell(row, name)}, by {size}",
+        )
+    return sorted(rows)
+
+
+def _found_jumps(raw: RawEpisode, system: System) -> Iterator[tuple[int, str, str]]:
+    """The row, the position and the size, with its unit, of every jump."""
     for name, values in raw.states.items():
         rows = raw.read(name)
         if system.rate_of(name) is None or len(rows) <= FROZEN_ROWS:
@@ -178,11 +204,4 @@ def jumps(raw: RawEpisode, system: System, note: Note) -> list[int]:
         jump = size > np.maximum(usual, JUMP_RATIO * lasting * np.abs(others).max(1))
         jump[1:] &= steps[:-1] != 0  # a sensor that stood still, which an effect of the catalogue does, then jumps
         for step in (np.flatnonzero(jump[AROUND_JUMP:-AROUND_JUMP]) + AROUND_JUMP).tolist():
-            row = int(rows[step + 1])
-            note(
-                f"{name} is suddenly elsewhere and stays there: its sensor lost count, or was moved; the episode was "
-                "split",
-                f"{raw.cell(row, name)}, by {departs[step]:.3g} {variable_of(system, name).unit}",
-            )
-            out.add(row)
-    return sorted(out)
+            yield int(rows[step + 1]), name, f"{departs[step]:.3g} {variable_of(system, name).unit}"

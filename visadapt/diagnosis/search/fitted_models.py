@@ -102,9 +102,9 @@ class FittedModels:
         self._slopes: tuple[Tensor, Tensor] | None = None
         self._screened: dict[tuple[str, ...], tuple[FitState, list[Candidate]]] = {}
         if source is None:
-            self.fit([((), initial_fit(system, rows))], CAREFUL)
+            self.fit([((), _from_readings(system, rows))], CAREFUL)
         elif source.state.shape[1] < rows.shape[0]:
-            self.fit([((), replace(source, state=initial_fit(system, rows).state))], FINAL)
+            self.fit([((), replace(source, state=_from_readings(system, rows).state))], FINAL)
         else:
             self.fitted[frozenset()] = ScoredModel((), source, float(source.likelihood[0]))
         if not math.isfinite(self.source.log_odds):
@@ -253,6 +253,17 @@ class FittedModels:
         if key not in self.fitted or _is_better(fitted, self.fitted[key]):
             self.fitted[key] = fitted
         return self.fitted[key]
+
+
+def _from_readings(system: System, rows: Segments) -> FitState:
+    """The start of the source's fit. With coloured noise, its states are smoothed: the steps of a fit, which lead to
+    the states that are most probable under white noise, are rejected where the coloured readings are likelier."""
+    start = initial_fit(system, rows)
+    if rows.colour is None:
+        return start
+    noise = {"log_process": rows.colour.log_process[None], "log_noise": rows.colour.log_noise[None]}
+    state = smoothed_states(CandidateModel(system, (), rows), replace(start, **noise))
+    return replace(start, state=state[None])
 
 
 def _rubs(found: ScoredModel) -> bool:

@@ -5,6 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import torch
+from torch import Tensor
+
 from visadapt.estimation.profiles import profile_of
 from visadapt.estimation.segments import Segments
 from visadapt.systems import System
@@ -37,9 +40,21 @@ def derived_velocities(system: System, rows: Segments) -> dict[str, float]:
         information = (acceleration.square() * used).sum()
         lag = -(error * acceleration * used).sum() / information
         variance = ((error + lag * acceleration).square() * used).sum() / used.sum()
-        if lag - SURE * (variance / information).sqrt() > MAX_LAG * rows.period:
+        # Where an estimator takes in a reading, its position and velocity jump together, which looks like a lag: it is
+        # none in most other rows.
+        late = lag - SURE * (variance / information).sqrt() > MAX_LAG * rows.period
+        if late and _median_lag(error, acceleration, used) > MAX_LAG * rows.period:
             out[system.states[channel].name] = float(lag)
     return out
+
+
+def _median_lag(error: Tensor, acceleration: Tensor, used: Tensor) -> float:
+    """The lag in s by least absolute values of error + lag acceleration, each (W, T): the weighted median of the
+    ratios."""
+    moving = (used > 0) & (acceleration != 0)
+    ratios, order = (-error[moving] / acceleration[moving]).sort()
+    weights = acceleration[moving].abs()[order].cumsum(0)
+    return float(ratios[torch.searchsorted(weights, weights[-1:] / 2)])
 
 
 COARSE_SHARE = 0.1
