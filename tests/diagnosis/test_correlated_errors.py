@@ -58,4 +58,3 @@ def test_an_effect_is_found_with_its_size_beside_them():
     low, high = result.causes[0].parameters["coefficient"].ci90
     assert low < 1.5 < high
     assert high - low < 0.3
-
