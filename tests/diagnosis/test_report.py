@@ -254,7 +254,7 @@ class TestWords:
     @pytest.mark.parametrize(
         ("after", "text"),
         [
-            (6.4, "the most probable of them close none of the gap;"),
+            (6.4, "none closes any of the gap;"),
             (1.3, "close 95 % of the gap, and what is left is"),
         ],
     )

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from visadapt.diagnosis.exploration import Explored, explore
 from visadapt.diagnosis.measured_gap import MeasuredGap, measure
-from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, UNEXPLAINED, Cause, Push, without_slight
+from visadapt.diagnosis.result import AMBIGUOUS, IDENTIFIED, UNEXPLAINED, Cause, Push
 from visadapt.diagnosis.search.apart import ExplainedAlone
 from visadapt.diagnosis.search.causes import causes
 from visadapt.diagnosis.search.fitted_models import ScoredModel
@@ -107,7 +107,7 @@ def _answer(
     verdict = verdict_of(comparison, measured.gap, measured.improvable, explaining, bool(repeats), coarse)
     found = explaining if verdict in (IDENTIFIED, AMBIGUOUS) else ()
     closes = verdict == UNEXPLAINED and not measured.gap.closed <= 0  # NaN where the source predicts within the noise
-    partial = tuple(without_slight(explaining)) if closes else ()
+    partial = tuple(one for one in explaining if _closes_part(one, measured.gap.closed)) if closes else ()
     if explored.changes:  # what else closes a part of the gap imitates the change
         changing = {effect.name for each in explored.changes for effect in each.effects}
         partial = tuple(cause for cause in partial if cause.effect in changing)
@@ -119,6 +119,12 @@ def _answer(
         model = CandidateModel(search.system, comparison.best.effects, search.rows)
         passing = depart_from(model, comparison.predicting, passing)
     return Answer(explored, measured, verdict, found, partial, source_leaves, passing, aside)
+
+
+def _closes_part(cause: Cause, closed: float) -> bool:
+    """Whether a cause of a gap that is unexplained is worth telling, where the best set has `closed` this share: it is
+    not slight, or closes half as much by itself, so that others only take its place."""
+    return not cause.slight or cause.gap_closed > 0.5 * closed
 
 
 def _hiding(unexplained: Answer, finder: _PushFinder) -> tuple[Push, ...]:

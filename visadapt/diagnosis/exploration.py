@@ -98,7 +98,7 @@ def explore(
         search, comparison = correlated
     elif comparison.leftover > MIN_LEFTOVER and not comparison.negligible and not search.rows.jumps:
         apart = explained_apart(found.some_rows, candidates, recording.sources, progress)
-        changes = () if apart else changing(found.some_rows, recording.sources)
+        changes = () if apart else changing(found.some_rows, recording.sources, _unknown(comparison, found))
     if not (apart or changes or correlated):
         again = staged(progress, "search with coloured noise")
         search, comparison = with_coloured_noise(search, comparison, prepared.searched, again)
@@ -108,6 +108,13 @@ def explore(
     groups = alternatives(comparison, named, system)
     errors = lasting(search) if correlated else {}
     return Explored(named, prepared, search, comparison, groups, repeats, apart, changes, errors)
+
+
+def _unknown(comparison: ModelComparison, found: _Searched) -> float:
+    """Log odds, on the rows searched, of the likeliest function that the best set leaves out and that time alone does
+    not give."""
+    share = float(found.some_rows.rows.inside.sum() / found.search.rows.inside.sum())
+    return share * max((one.log_odds for one in comparison.functions if one.variable != "time"), default=0.0)
 
 
 def _on_all_rows(search: Search, rows: Segments, progress: Progress | None) -> Search:

@@ -24,6 +24,12 @@ MOTIONS_IN_FLIGHT = {
 }
 """Those that differ for an aircraft."""
 
+MOTIONS_WITHOUT_JOINTS = {
+    Stage.DYNAMICS: "runs in which every command rests, from several states on",
+    Stage.SENSING: "each sensor beside one that is known to be right, while nothing changes",
+}
+"""Those that differ for a system that no force or torque moves, such as a tank."""
+
 LOOK = (
     "Look at the frames where they are unexplained: if the scene itself is another one, train a renderer on frames of "
     "it; if light, lens or something that moves is the cause, film without it."
@@ -90,7 +96,7 @@ def separate(classes: Sequence[Collection[type[Effect]]], system: System) -> str
                     settled |= {name, other}
         if len(names) > 1:
             every = settled == set(names)
-            general = f"{_general(members, profile_of(system))}; --plan says whether commands alone would do"
+            general = f"{_general(members, system)}; --plan says whether commands alone would do"
             advice = experiments if every else [*experiments, general]
             parts.append(f"To tell {listed(names)} apart: " + "; ".join(advice) + ".")
     return " ".join(parts)
@@ -154,7 +160,9 @@ def finer(positions: Sequence[str]) -> str:
     return f"Read {listed(positions)} in finer steps, or record motions that are large against these steps."
 
 
-def _general(members: Collection[type[Effect]], profile: SystemProfile) -> str:
-    motions = MOTIONS | (MOTIONS_IN_FLIGHT if profile.is_aircraft else {})
+def _general(members: Collection[type[Effect]], system: System) -> str:
+    motions = MOTIONS | (MOTIONS_IN_FLIGHT if profile_of(system).is_aircraft else {})
+    if not any(load.unit in ("N", "N m") for load in system.loads):
+        motions |= MOTIONS_WITHOUT_JOINTS
     stages = sorted({effect.stage for effect in members})
     return "record " + ", then ".join(motions[stage] for stage in stages if stage in motions)

@@ -181,7 +181,8 @@ def jumps(raw: RawEpisode, system: System, note: Note) -> list[int]:
         return []
     for row, name, size in found:
         note(
-            f"{name} is suddenly elsewhere and stays there: its sensor lost count, or was moved; the episode was split",
+            f"{name} is suddenly elsewhere and stays there: its sensor lost count or was moved, or an estimator was "
+            "reset; the episode was split",
             f"{raw.cell(row, name)}, by {size}",
         )
     return sorted(rows)

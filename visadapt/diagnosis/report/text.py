@@ -201,11 +201,13 @@ def _unexplained(diagnosis: Diagnosis) -> str:
     best = gap.closed
     black_box = (gap.before - gap.black_box) / (gap.before - gap.floor) if gap.before != gap.floor else math.nan
     text, most = "Something acts that no known effect explains: ", "the most probable of them"
+    none = "none closes any of the gap"
     if BETWEEN_ROWS in diagnosis.warnings:
         text, most = "The recording lacks commands that were sent between its rows: ", "the most probable effects"
+        none = f"{most} close none of the gap"
     if best <= 0:
-        text += f"{most} close none of the gap"
-    elif black_box > best:
+        text += none
+    elif closed(black_box) != closed(best) and black_box > best:
         text += f"{most} close {closed(best)} of the gap, with a black box {closed(black_box)}"
     else:
         text += f"{most} close {closed(best)} of the gap, and what is left is not noise"
@@ -238,7 +240,7 @@ def alone(cause: Cause) -> str:
         said += ", alone makes the gap larger" if larger else f", closes {closed(cause.gap_closed)}{of} alone"
     if math.isfinite(cause.gap_reopened):
         share = "more than the whole gap" if round(cause.gap_reopened, 2) > 1 else percent(cause.gap_reopened)
-        said += f", without it {share} opens again"
+        said += f", without it {share if round(cause.gap_reopened, 2) > 0 else 'nothing'} opens again"
     return said
 
 

@@ -49,14 +49,18 @@ class Changing:
     starts: tuple[float, ...] = ()  # s at which the stretches start, where all are of one episode; else none
 
 
-def changing(search: Search, sources: Sequence[str]) -> tuple[Changing, ...]:
+def changing(search: Search, sources: Sequence[str], unknown: float = 0.0) -> tuple[Changing, ...]:
     """What explains a recording if its sizes may change within it, the most probable first; nothing, where they do not
     or that does not explain it either. Where sizes that change from file to file explain it, it is these.
 
-    `sources` are those of its episodes (`Recording.sources`).
+    Args:
+        search: that has run.
+        sources: those of the recording's episodes (`Recording.sources`).
+        unknown: log odds that an unknown function of constant size adds to the best set; changes must add more.
     """
     files = windows_by_file(search.rows, sources)
-    if 1 < len(files) <= MOST_PARTS and (found := _between(search, list(files.values()))):
+    least = search.best.log_odds + max(MIN_LOG_ODDS, unknown)
+    if 1 < len(files) <= MOST_PARTS and (found := _between(search, list(files.values()), least)):
         return tuple(replace(one, files=tuple(files)) for one in found)
     count = search.rows.shape[0]
     if count < FEWEST_PARTS:
@@ -64,21 +68,21 @@ def changing(search: Search, sources: Sequence[str]) -> tuple[Changing, ...]:
     parts = torch.arange(count).tensor_split(min(MOST_PARTS, count))
     one_episode = len(search.rows.episode.unique()) == 1
     starts = tuple(float(search.rows.time[part[0], 0]) for part in parts if one_episode)
-    return tuple(replace(one, starts=starts) for one in _between(search, parts))
+    return tuple(replace(one, starts=starts) for one in _between(search, parts, least))
 
 
-def _between(search: Search, parts: Sequence[Tensor]) -> tuple[Changing, ...]:
-    """What explains a recording if its sizes may change from one of these parts, of the windows, to the next."""
+def _between(search: Search, parts: Sequence[Tensor], least: float) -> tuple[Changing, ...]:
+    """What explains a recording, with more than the `least` log odds, if its sizes may change from one of these parts,
+    of the windows, to the next."""
     try:
         stretches = [
             FittedModels(search.system, search.rows.select(part), search.catalogue, jobs=search.jobs) for part in parts
         ]
     except NoFitError:
         return ()
-    best = search.best.log_odds
     for tried in _tried(search):
         found = [one for each in tried if (one := _in_stretches(search, stretches, each))]
-        if found := [one for one in found if one.log_odds > best + MIN_LOG_ODDS]:
+        if found := [one for one in found if one.log_odds > least]:
             found.sort(key=lambda one: -one.log_odds)
             return tuple(one for one in found if one.log_odds >= found[0].log_odds - AS_LIKELY)
     return ()

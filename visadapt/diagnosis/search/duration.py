@@ -15,6 +15,8 @@ likelihood that the best effect promises. Measured on recordings with hidden eff
 
 FINAL_STEPS = {0.0: 80, 10.0: 120}  # Duration of the fits to all rows and of the predictions, in steps on all rows
 
+LONGEST = 30  # Times the expected duration, at most, that a diagnosis took where much stayed unexplained
+
 SHARED = 0.6  # Speed that each process beyond the first adds, as a share of that of the first
 
 
@@ -50,10 +52,12 @@ def announcement(rows: Segments, effects: int, seconds: float, jobs: int) -> str
     >>> ones = [torch.ones(120, 2).double()]
     >>> rows = cut(ones, ones, ones, [torch.arange(120.0)], (0, 2), 1.0, 120)
     >>> announcement(rows, 24, 87.0, 2)
-    '120 rows of 2 channels, 24 effects: about 90 s on 2 cores, up to 30 times that where much stays unexplained'
+    '120 rows of 2 channels, 24 effects: about 90 s on 2 cores, up to 45 min where much stays unexplained'
     """
     count, channels = int(rows.inside.sum()), len(rows.channels)
     rounded = float(f"{seconds:.1g}") if seconds < 100 else float(f"{seconds:.2g}")
     cores = "1 core" if jobs == 1 else f"{jobs} cores"
-    about = f"about {rounded:g} s on {cores}, up to 30 times that where much stays unexplained"
+    longest = LONGEST * rounded
+    most = f"{longest:.2g} s" if longest < 120 else f"{round(longest / 60)} min"
+    about = f"about {rounded:g} s on {cores}, up to {most} where much stays unexplained"
     return f"{count:,} rows of {channels} channels, {effects} effects: {about}"
