@@ -1,6 +1,7 @@
 """Recordings within which an effect changes: it is said what, and how large it is from stretch to stretch."""
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -9,6 +10,10 @@ import torch
 from tests.diagnosed import record
 from visadapt.diagnosis import diagnose
 from visadapt.diagnosis.next_experiment import AS_IT_CHANGES, OF_ONE_MACHINE
+from visadapt.diagnosis.search import changing
+from visadapt.diagnosis.search.fitted_models import FittedModels
+from visadapt.diagnosis.search.preparation import prepare
+from visadapt.diagnosis.search.search import Search
 from visadapt.diagnosis.words import CHANGES, CHANGES_BETWEEN
 from visadapt.effects import ActuatorGain, CoulombFriction, PoleLength, ViscousFriction
 from visadapt.effects.forces import CartForce
@@ -123,3 +128,13 @@ def test_of_a_file_that_nothing_explains_nothing_is_said():
 def test_of_what_stays_the_same_nothing_is_said(effects):
     found = diagnose(one_after_the_other([effects] * 6), World(CartPole()), CATALOGUE)
     assert not any(warning.startswith(CHANGES) for warning in found.warnings)
+
+
+def test_sizes_none_of_which_is_likelier_than_nothing_are_not_said(monkeypatch):
+    """Of a pole with cogging it was once said that a bias changes: from 0 to 0, six times."""
+    monkeypatch.setattr(changing, "MIN_CHANGE", 0.0)
+    monkeypatch.setattr(changing, "MAX_LEFT", math.inf)
+    rows = prepare(one_after_the_other([()] * 6), CartPole()).rows
+    search = Search(CartPole(), rows, [ActuatorGain])
+    stretches = [FittedModels(CartPole(), rows.select(torch.tensor([k])), [ActuatorGain]) for k in range(6)]
+    assert changing._in_stretches(search, stretches, search.single(ActuatorGain)) is None

@@ -103,6 +103,8 @@ def _in_stretches(search: Search, stretches: Sequence[FittedModels], whole: Scor
     acts = [fit.log_odds > each.source.log_odds for each, fit in zip(stretches, fits, strict=True)]
     values = [tuple(fit.fits.theta[0].tolist()) if act else nothing for fit, act in zip(fits, acts, strict=True)]
     log_odds = sum(max(fit.log_odds, each.source.log_odds) for each, fit in zip(stretches, fits, strict=True))
+    if log_odds < sum(each.source.log_odds for each in stretches) + MIN_LOG_ODDS:
+        return None  # the noise alone differs from stretch to stretch
     return Changing(whole.effects, tuple(values), log_odds)
 
 
