@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from visadapt.diagnosis.search.apart import windows_by_file
+from visadapt.diagnosis.search.causes import is_at_end
 from visadapt.diagnosis.search.fitted_models import FittedModels, NoFitError, ScoredModel, key_of
 from visadapt.diagnosis.search.search import Search
 from visadapt.effects import Effect, Role
@@ -105,6 +106,10 @@ def _in_stretches(search: Search, stretches: Sequence[FittedModels], whole: Scor
     log_odds = sum(max(fit.log_odds, each.source.log_odds) for each, fit in zip(stretches, fits, strict=True))
     if log_odds < sum(each.source.log_odds for each in stretches) + MIN_LOG_ODDS:
         return None  # the noise alone differs from stretch to stretch
+    table = [parameter for effect in whole.effects for parameter in effect.table]
+    sizes = [(parameter, size) for each in values for parameter, size in zip(table, each, strict=True)]
+    if any(is_at_end(one, size, end) for one, size in sizes for end in (one.low, one.high)):
+        return None  # what goes to the end of its range imitates something else
     return Changing(whole.effects, tuple(values), log_odds)
 
 

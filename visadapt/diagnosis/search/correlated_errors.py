@@ -39,6 +39,10 @@ error does that depends on the state."""
 
 MANY_ROWS = 2.0  # Rows that errors of readings must last for to be told of
 
+FEWEST_SENSORS = 2
+"""States whose readings must err so, since an estimator errs in several: one sensor alone may err by where it is, as an
+encoder does that is off its axis."""
+
 MOST_DECAY = 0.99  # Sum of an autoregression's coefficients at most: windows are too short to show slower errors
 
 
@@ -65,7 +69,7 @@ def lasting(search: Search) -> dict[tuple[str, ...], float]:
     those kinds whose errors last for more than MANY_ROWS."""
     rows = search.rows
     assert rows.colour is not None
-    decay = rows.colour.coefficients.diagonal(dim1=1, dim2=2).sum(0)  # (m,)
+    decay = _decay(rows.colour)
     out = {}
     for kind in search.profile.sensors:
         read = [k for k, channel in enumerate(rows.channels) if channel in kind]
@@ -75,6 +79,11 @@ def lasting(search: Search) -> dict[tuple[str, ...], float]:
         if count > MANY_ROWS:
             out[tuple(search.system.states[rows.channels[k]].name for k in read)] = count * rows.period
     return out
+
+
+def _decay(errors: Colour) -> Tensor:
+    """(m,) sums of each channel's coefficients: 0 for white noise, near 1 for errors that last long."""
+    return errors.coefficients.diagonal(dim1=1, dim2=2).sum(0)
 
 
 def _errors_beside_set(search: Search, found: ScoredModel) -> Colour | None:
@@ -91,6 +100,8 @@ def _errors_beside(search: Search, found: ScoredModel) -> Colour | None:
     quiet = replace(found, fits=search.without_process_noise([found])[0].fits)
     errors = colour_left_by(search, quiet, own=True)
     if errors is None or len(errors.coefficients) > MOST_LAGS:
+        return None
+    if int((_decay(errors) > 1 - 1 / MANY_ROWS).sum()) < FEWEST_SENSORS:
         return None
     likelihood = _likelihood(search, quiet, errors)
     if likelihood < float(found.fits.likelihood[0]) + CLEARLY:
